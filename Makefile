@@ -1,0 +1,46 @@
+# Every habit of the project; `make` alone lists them. CI runs nothing else.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow format lint type check bench clean
+
+help:  ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+$(VENV)/.installed: setup.cfg constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed (MuJoCo 4); set PYTHON=... ")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[tests]'
+	@touch $@
+
+setup: $(VENV)/.installed  ## make .venv and install the package with its pinned dependencies
+
+demo: setup  ## collect, pretrain, train PPO, draw: the whole product in about ten minutes, into demo/
+	$(BIN)/python -m sb3_abisim.demo -o demo
+
+test: setup  ## the tests that CI runs
+	$(BIN)/python -m pytest
+
+test-slow: setup  ## the tests that take minutes
+	$(BIN)/python -m pytest -m slow
+
+format: setup  ## rewrite the code in the project's format
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+lint: setup  ## format and lint, without changing anything
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+type: setup  ## mypy in strict mode
+	$(BIN)/python -m mypy sb3_abisim
+
+check: lint type test  ## all of the above that must be green
+
+bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
+	$(BIN)/python -m benchmarks.bench_envs
+
+clean:  ## remove the environment and caches
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info

@@ -1,0 +1,254 @@
+"""One implementation of each environment: a batch of n, and the Gymnasium environment as its batch of one.
+
+A subclass of :class:`BatchEnv` writes the dynamics once, over a leading batch dimension. :class:`SingleEnv` turns a
+batch of one into a ``gymnasium.Env``. Every copy owns a random generator, so copy ``i`` of a batch reset with
+``seed=s`` and a single environment reset with ``seed=s + i`` see the same episodes.
+"""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+
+class BatchEnv(gym.vector.VectorEnv):
+    """``num_envs`` independent copies of an environment, stepped by one call.
+
+    Finished copies start their next episode within the same ``step`` (``AutoresetMode.SAME_STEP``): the returned
+    observation is the new episode's first and ``infos["final_obs"]`` holds the last one of the old episode, as
+    Stable-Baselines3 expects of a ``VecEnv``. ``infos["is_success"]`` is a bool array, true where the goal has just
+    been reached (it describes the step, before any reset).
+
+    :param num_envs: number of copies, at least 1
+    :param observation_space: of one copy
+    :param action_space: of one copy, ``Discrete`` or ``Box``
+    :param max_episode_steps: steps after which an episode is truncated, None for no limit
+    :param render_mode: None or "rgb_array"
+    :param autoreset: False leaves finished copies for :class:`SingleEnv` to reset
+    """
+
+    metadata: dict[str, Any] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int,
+        observation_space: gym.Space,
+        action_space: gym.Space,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        autoreset: bool = True,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1 or None, got {max_episode_steps}")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.max_episode_steps = max_episode_steps
+        self.single_observation_space = observation_space
+        self.single_action_space = action_space
+        self.observation_space = batch_space(observation_space, num_envs)
+        self.action_space = batch_space(action_space, num_envs)
+        self._autoreset = autoreset
+        self._generators: list[np.random.Generator] = []
+        self._elapsed = np.zeros(num_envs, dtype=np.int64)
+        self._finished = np.ones(num_envs, dtype=bool)
+
+    # The dynamics, written by subclasses over index arrays.
+
+    def _reset_envs(self, indices: NDArray[np.int64]) -> None:
+        """Start a new episode in each of the copies ``indices``, drawing from ``self._generators[i]`` alone."""
+        raise NotImplementedError
+
+    def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Move every copy by one step.
+
+        :param actions: valid actions, shape (num_envs, *action shape)
+        :return: rewards and whether the goal was reached (which ends the episode), each of shape (num_envs,)
+        """
+        raise NotImplementedError
+
+    def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Observations of the copies ``indices`` in a new array, shape (len(indices), *observation shape)."""
+        raise NotImplementedError
+
+    def _render_frame(self, index: int) -> NDArray[np.uint8]:
+        """A picture of one copy that a person can look at, shape (height, width, 3), RGB."""
+        raise NotImplementedError
+
+    def factors(self) -> dict[str, NDArray[Any]]:
+        """The simulator's state behind the current observations, for probes; no loss may read it.
+
+        :return: name to array of shape (num_envs, ...), copies
+        """
+        raise NotImplementedError
+
+    # The Gymnasium interface.
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """Start a new episode in every copy.
+
+        :param seed: copy i gets ``seed + i``, or ``seed[i]`` of a list; None goes on with the present generators
+        :param options: none are known
+        """
+        if options:
+            raise ValueError(f"{type(self).__name__} knows no reset options, got {sorted(options)}")
+        seeds = list(seed) if isinstance(seed, (list, tuple)) else None
+        if seeds is None:
+            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]  # type: ignore[arg-type]
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"got {len(seeds)} seeds for {self.num_envs} environments")
+        fresh = not self._generators
+        for i, one in enumerate(seeds):
+            if fresh:
+                self._generators.append(seeding.np_random(one)[0])
+            elif one is not None:
+                self._generators[i] = seeding.np_random(one)[0]
+        everyone = np.arange(self.num_envs)
+        self._begin(everyone)
+        return self._observe(everyone), {}
+
+    def _begin(self, indices: NDArray[np.int64]) -> None:
+        self._reset_envs(indices)
+        self._elapsed[indices] = 0
+        self._finished[indices] = False
+
+    def step(
+        self, actions: Any
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Take one action in every copy.
+
+        :param actions: shape (num_envs, *action shape)
+        :raises ValueError: for an action of the wrong shape, out of range, or not finite
+        :raises RuntimeError: before the first reset, or for a finished copy that was not reset
+        """
+        actions = self._check_actions(actions)
+        if self._finished.any():
+            raise RuntimeError("the episode is over (or has not begun): call reset() before step()")
+        rewards, reached = self._advance(actions)
+        self._elapsed += 1
+        if self.max_episode_steps is None:
+            truncated = np.zeros(self.num_envs, dtype=bool)
+        else:
+            truncated = (self._elapsed >= self.max_episode_steps) & ~reached
+        done = reached | truncated
+        infos: dict[str, Any] = {"is_success": reached.copy(), "_is_success": np.ones(self.num_envs, dtype=bool)}
+        everyone = np.arange(self.num_envs)
+        observations = self._observe(everyone)
+        if done.any():
+            self._finished |= done
+            if self._autoreset:
+                infos |= self._restart(np.flatnonzero(done), observations, infos)
+        return observations, rewards, reached, truncated, infos
+
+    def _restart(
+        self, ended: NDArray[np.int64], observations: NDArray[np.uint8], infos: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Begin new episodes in ``ended``, write their first frames into ``observations``, return the final infos."""
+        mask = np.zeros(self.num_envs, dtype=bool)
+        mask[ended] = True
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        for i in ended:
+            final_obs[i] = observations[i].copy()
+        final_factors = {name: np.where(_along(mask, array), array, 0) for name, array in self.factors().items()}
+        self._begin(ended)
+        observations[ended] = self._observe(ended)
+        final_info = {
+            "is_success": infos["is_success"] & mask,
+            "_is_success": mask.copy(),
+            "factors": final_factors,
+            "_factors": mask.copy(),
+        }
+        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+
+    def _check_actions(self, actions: Any) -> NDArray[Any]:
+        space, array = self.single_action_space, np.asarray(actions)
+        expected = (self.num_envs, *(space.shape or ()))
+        if array.shape != expected:
+            raise ValueError(f"actions must have shape {expected}, got shape {array.shape}: {actions!r}")
+        if isinstance(space, gym.spaces.Discrete):
+            if not np.issubdtype(array.dtype, np.integer):
+                raise ValueError(f"actions must be integers, got dtype {array.dtype}: {actions!r}")
+            low, high = int(space.start), int(space.start + space.n - 1)
+        else:
+            assert isinstance(space, gym.spaces.Box)
+            if not np.issubdtype(array.dtype, np.number):
+                raise ValueError(f"actions must be numbers, got dtype {array.dtype}: {actions!r}")
+            low, high = space.low, space.high  # type: ignore[assignment]
+        # Written so that NaN, which compares false, counts as out of range.
+        inside = (array >= low) & (array <= high)
+        if not inside.all():
+            bad = array[~inside.reshape(self.num_envs, -1).all(axis=1)][0]
+            raise ValueError(f"action {bad!r} is outside {space}; clip or rescale it before step()")
+        return array
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+        """A picture of every copy, each (height, width, 3) uint8 RGB; None without ``render_mode``."""
+        if self.render_mode is None:
+            return None
+        return tuple(self._render_frame(i) for i in range(self.num_envs))
+
+
+class SingleEnv(gym.Env):
+    """A ``gymnasium.Env`` made of a :class:`BatchEnv` of one copy.
+
+    ``info["is_success"]`` is a bool at every step. Episodes have no time limit of their own: ``gymnasium.make`` adds
+    the registered one.
+
+    :param render_mode: None or "rgb_array"
+    :param kwargs: passed to the batch class
+    """
+
+    batch_class: ClassVar[type[BatchEnv]]
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
+        self.batch = self.batch_class(num_envs=1, render_mode=render_mode, autoreset=False, **kwargs)  # type: ignore[call-arg]
+        self.render_mode = render_mode
+        self.observation_space = self.batch.single_observation_space
+        self.action_space = self.batch.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """Start a new episode; ``seed`` determines it and all that follow."""
+        super().reset(seed=seed)
+        observations, _ = self.batch.reset(seed=seed, options=options)
+        # One generator: a wrapper that draws from `env.np_random` advances the same stream as the environment.
+        self._np_random = self.batch._generators[0]
+        return observations[0], {}
+
+    def step(self, action: Any) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        """Take one action.
+
+        :raises ValueError: for an action of the wrong shape, out of range, or not finite
+        """
+        observations, rewards, terminated, truncated, infos = self.batch.step(np.asarray(action)[None])
+        info = {"is_success": bool(infos["is_success"][0])}
+        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def factors(self) -> dict[str, NDArray[Any]]:
+        """The simulator's state behind the current observation, for probes; see :meth:`BatchEnv.factors`."""
+        return {name: array[0] for name, array in self.batch.factors().items()}
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """A picture that a person can look at, (height, width, 3) uint8 RGB; None without ``render_mode``."""
+        frames = self.batch.render()
+        return None if frames is None else frames[0]
+
+
+def _along(mask: NDArray[np.bool_], array: NDArray[Any]) -> NDArray[np.bool_]:
+    """``mask`` with trailing axes added, so that it broadcasts against ``array``."""
+    return mask.reshape(-1, *[1] * (array.ndim - 1))

@@ -1,0 +1,133 @@
+"""The encoders and the small heads that objectives put on them.
+
+An encoder takes what Stable-Baselines3 hands to a features extractor: float images in 0..1, channels first. The paper
+trains on -1..+1, so that affine map is the encoder's first layer.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+import torch as th
+from torch import nn
+
+
+class Encoder(nn.Module):
+    """A convolutional network from images to an embedding, rebuilt from :meth:`spec` alone.
+
+    :param layers: module from float images (batch, channels, height, width) in -1..1 to (batch, features_dim)
+    :param features_dim: size of the embedding
+    :param constructor_kwargs: the constructor arguments of the subclass, JSON types only
+    """
+
+    # (channels, height, width) that the subclass is made for.
+    observation_shape: tuple[int, int, int]
+
+    def __init__(self, layers: nn.Module, features_dim: int, constructor_kwargs: dict[str, Any]) -> None:
+        super().__init__()
+        self.layers = layers
+        self.features_dim = features_dim
+        self._constructor_kwargs = constructor_kwargs
+
+    def spec(self) -> dict[str, Any]:
+        """The architecture as JSON: ``make_encoder(space, spec["name"], **spec["kwargs"])`` builds it again."""
+        return {"name": type(self).__name__, "kwargs": dict(self._constructor_kwargs)}
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Embed images.
+
+        :param observations: float (batch, channels, height, width) in 0..1
+        :return: float (batch, features_dim)
+        """
+        features: th.Tensor = self.layers(2.0 * observations - 1.0)
+        return features
+
+
+class Nav2DEncoder(Encoder):
+    """15 x 15 grids to 576 = 64 x 3 x 3 numbers, the size that the paper's inverse model (2 x 576 inputs) implies.
+
+    The paper gives no layers for Nav2D. Ours: 3x3 convolutions with 32, 64, 64 channels and no padding, the first with
+    stride 2 (15 -> 7 -> 5 -> 3), no nonlinearity after the last.
+
+    :param n_input_channels: channels of the observation
+    """
+
+    observation_shape = (3, 15, 15)
+
+    def __init__(self, n_input_channels: int = 3) -> None:
+        layers = nn.Sequential(
+            nn.Conv2d(n_input_channels, 32, 3, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 3),
+            nn.ReLU(),
+            nn.Conv2d(64, 64, 3),
+            nn.Flatten(),
+        )
+        super().__init__(layers, 576, {"n_input_channels": n_input_channels})
+
+
+class PointMazeEncoder(Encoder):
+    """64 x 64 pictures to 32 numbers: the paper's table for Pointmass.
+
+    3x3 convolutions with stride 2 to 8 x 32 x 32 and 16 x 16 x 16, then an 8x8 convolution to 32 x 1 x 1. An 8x8
+    kernel does not reduce a 16 x 16 map to 1 x 1; we put a 2x2 max pooling before it, which does.
+
+    :param n_input_channels: channels of the observation
+    :param features_dim: size of the embedding, 32 in the paper
+    """
+
+    observation_shape = (3, 64, 64)
+
+    def __init__(self, n_input_channels: int = 3, features_dim: int = 32) -> None:
+        layers = nn.Sequential(
+            nn.Conv2d(n_input_channels, 8, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(8, 16, 3, stride=2, padding=1),
+            nn.ReLU(),
+            nn.MaxPool2d(2),
+            nn.Conv2d(16, features_dim, 8),
+            nn.Flatten(),
+        )
+        super().__init__(layers, features_dim, {"n_input_channels": n_input_channels, "features_dim": features_dim})
+
+
+ENCODERS: dict[str, type[Encoder]] = {cls.__name__: cls for cls in (Nav2DEncoder, PointMazeEncoder)}
+
+
+def make_encoder(observation_space: gym.Space, name: str | None = None, **kwargs: Any) -> Encoder:
+    """Build an encoder for an observation space.
+
+    :param observation_space: a channels-first image space
+    :param name: a key of :data:`ENCODERS`; None takes the one made for the space's shape
+    :param kwargs: passed to its constructor
+    :raises ValueError: for an unknown name or keyword, or a space that the network does not fit
+    """
+    shape = observation_space.shape
+    if name is None:
+        fitting = [key for key, cls in ENCODERS.items() if cls.observation_shape == shape]
+        if not fitting:
+            known = ", ".join(f"{key} {cls.observation_shape}" for key, cls in ENCODERS.items())
+            raise ValueError(f"no default encoder for observations of shape {shape}; known are: {known}")
+        name = fitting[0]
+    if name not in ENCODERS:
+        raise ValueError(f"unknown encoder network {name!r}; known are {sorted(ENCODERS)}")
+    try:
+        encoder = ENCODERS[name](**kwargs)
+    except TypeError as error:
+        raise ValueError(f"{name} does not take these arguments: {error}") from error
+    expected = (kwargs.get("n_input_channels", 3), *encoder.observation_shape[1:])
+    if shape != expected:
+        raise ValueError(f"{name} takes observations of shape {expected}, got {shape}")
+    return encoder
+
+
+class MLP(nn.Sequential):
+    """A multilayer perceptron with ReLU between its linear layers.
+
+    :param dims: sizes of input, hidden layers and output
+    """
+
+    def __init__(self, *dims: int) -> None:
+        layers: list[nn.Module] = []
+        for n_in, n_out in zip(dims[:-1], dims[1:], strict=True):
+            layers += [nn.Linear(n_in, n_out), nn.ReLU()]
+        super().__init__(*layers[:-1])

@@ -1,0 +1,229 @@
+"""Action-bisimulation (the paper's Eqs. 6 to 8 and Algorithm 1).
+
+====================  ==============================  =====================================================
+paper                 here                            meaning
+====================  ==============================  =====================================================
+psi_theta             ``base_encoder``                single-step encoder, trained before and frozen
+phi_eta               ``encoder``                     multi-step encoder, the result
+phi                   ``target_encoder``              its exponential moving average, for the target
+f_upsilon             ``forward_model``               Gaussian model of phi(s') given phi(s) and a
+c                     ``c``                           weight of the recursive step
+tau                   ``tau``                         rate of the moving average
+====================  ==============================  =====================================================
+
+Every pair of states of a batch is used, where the paper samples pairs: the distances between n embeddings cost little
+beside the n embeddings. Two expectations over actions are offered:
+
+* ``expectation="uniform"``: the forward model predicts the next embedding for all discrete actions, or for
+  ``n_action_samples`` uniform continuous ones, the same for both states (Eq. 7).
+* ``expectation="behaviour"``: pairs are transitions that took the same action, and the target uses the next states
+  that were seen; no forward model stands in the target. For continuous actions a pair's actions differ by at most
+  ``action_radius`` in the L2 norm. The target is then one sample of the expectation, so its loss must be the squared
+  one: the minimiser of the paper's absolute difference would be the median over actions, and an obstacle that
+  blocks one of four moves would not count.
+
+Departures that the released code makes and that are options here: smooth L1 as loss, resetting the forward model
+at an interval, starting from the base encoder's weights.
+"""
+
+import copy
+import math
+
+import gymnasium as gym
+import torch as th
+from torch import nn
+
+from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.objectives.base import Objective, TensorBatch
+
+LOSSES = {"l1": nn.functional.l1_loss, "smooth_l1": nn.functional.smooth_l1_loss, "mse": nn.functional.mse_loss}
+EXPECTATIONS = ("uniform", "behaviour")
+WASSERSTEIN = ("means", "gaussian")
+HIDDEN_DIM = 256
+_LOG_STD_RANGE = (-5.0, 2.0)
+
+
+def action_bisim_target(base_distance: th.Tensor, next_distance: th.Tensor, c: float) -> th.Tensor:
+    """Eq. 7: ``(1 - c) |psi(s_i) - psi(s_j)|_1 + c E_a[W_1(s_i, s_j, a)]``.
+
+    :param base_distance: L1 distances of single-step embeddings, any shape
+    :param next_distance: expected W1 distances of next embeddings, same shape
+    :param c: 0 <= c < 1
+    """
+    return (1.0 - c) * base_distance + c * next_distance
+
+
+def w1_gaussian(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: th.Tensor) -> th.Tensor:
+    """W1 distance under the L1 norm between Gaussians with independent dimensions, exact.
+
+    In one dimension the optimal coupling moves x to mean + std z for the same z, so the distance is the mean of a
+    folded normal, ``E|m + s z|`` with m, s the differences of means and standard deviations. Under the L1 norm the
+    dimensions add up. With equal standard deviations this is the L1 distance of the means.
+
+    :return: distances, summed over the last dimension
+    """
+    m, s = mean_i - mean_j, (std_i - std_j).abs()
+    # A vanishing s would divide by zero; the limit is |m|, which this value reaches in float32.
+    safe = s.clamp_min(1e-6)
+    folded = safe * math.sqrt(2.0 / math.pi) * th.exp(-0.5 * (m / safe) ** 2) + m * th.erf(m / safe / math.sqrt(2.0))
+    return folded.sum(dim=-1)
+
+
+def same_action_pairs(actions: th.Tensor, radius: float) -> th.Tensor:
+    """Which pairs of transitions took the same action.
+
+    :param actions: int64 (batch,), or float32 (batch, action_dim)
+    :param radius: largest L2 distance that counts as the same, for continuous actions
+    :return: bool (batch, batch)
+    """
+    if actions.dim() == 1:
+        return actions[:, None] == actions[None]
+    return th.cdist(actions, actions) <= radius
+
+
+class ForwardModel(nn.Module):
+    """Gaussian model of the next embedding: ``N(mean, diag(std^2))`` given an embedding and an action.
+
+    :param features_dim: size of the embedding
+    :param action_dim: size of the action input
+    """
+
+    def __init__(self, features_dim: int, action_dim: int) -> None:
+        super().__init__()
+        self.dims = (features_dim + action_dim, HIDDEN_DIM, 2 * features_dim)
+        self.network = MLP(*self.dims)
+
+    def forward(self, phi: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and standard deviation, each (batch, features_dim); the mean is predicted as a change of ``phi``."""
+        change, log_std = self.network(th.cat([phi, actions], dim=1)).chunk(2, dim=1)
+        return phi + change, log_std.clamp(*_LOG_STD_RANGE).exp()
+
+    def nll(self, phi: th.Tensor, actions: th.Tensor, phi_next: th.Tensor) -> th.Tensor:
+        """Eq. 6: negative log-likelihood of the next embedding, mean over batch and dimensions."""
+        mean, std = self(phi, actions)
+        return -th.distributions.Normal(mean, std).log_prob(phi_next).mean()
+
+    def reset(self) -> None:
+        """Draw new weights."""
+        self.network.load_state_dict(MLP(*self.dims).state_dict())
+
+
+class ActionBisimulation(Objective):
+    """Make L1 distances of embeddings equal the action-bisimulation metric.
+
+    :param encoder: the network to pretrain
+    :param action_space: ``Discrete`` or one-dimensional ``Box``
+    :param base_encoder: any trained encoder; frozen here
+    :param c: weight of the recursive step, 0 <= c < 1
+    :param tau: rate of the target encoder, per update
+    :param expectation: "uniform" or "behaviour" (module docstring)
+    :param distance_loss: "l1" (the paper), "smooth_l1" (the released code) or "mse"
+    :param wasserstein: "means" or "gaussian", which also counts the predicted variance (:func:`w1_gaussian`)
+    :param n_action_samples: continuous actions per update for "uniform"
+    :param action_radius: see :func:`same_action_pairs`, for continuous "behaviour"
+    :param warm_start: begin from the base encoder's weights, if it is the same network
+    :param forward_reset_interval: updates between resets of the forward model, None for never
+    """
+
+    name = "abisim"
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        action_space: gym.Space,
+        base_encoder: Encoder,
+        c: float = 0.9,
+        tau: float = 0.01,
+        expectation: str = "uniform",
+        distance_loss: str = "l1",
+        wasserstein: str = "means",
+        n_action_samples: int = 8,
+        action_radius: float = 0.2,
+        warm_start: bool = False,
+        forward_reset_interval: int | None = None,
+    ) -> None:
+        super().__init__(encoder, action_space)
+        if not 0 <= c < 1:
+            raise ValueError(f"c must lie in [0, 1), got {c}: the recursion has no fixed point otherwise")
+        if not 0 < tau <= 1:
+            raise ValueError(f"tau must lie in (0, 1], got {tau}")
+        for value, known in ((expectation, EXPECTATIONS), (distance_loss, LOSSES), (wasserstein, WASSERSTEIN)):
+            if value not in known:
+                raise ValueError(f"{value!r} is not one of {tuple(known)}")
+        if expectation == "behaviour" and wasserstein != "means":
+            raise ValueError("wasserstein='gaussian' needs the forward model of expectation='uniform'")
+        if forward_reset_interval is not None and forward_reset_interval < 1:
+            raise ValueError(f"forward_reset_interval must be at least 1 or None, got {forward_reset_interval}")
+        self.c, self.tau = c, tau
+        self.expectation, self.distance_loss, self.wasserstein = expectation, distance_loss, wasserstein
+        self.n_action_samples, self.action_radius = n_action_samples, action_radius
+        self.forward_reset_interval = forward_reset_interval
+        if warm_start:
+            if encoder.spec() != base_encoder.spec():
+                raise ValueError(
+                    f"warm_start needs equal networks, got {encoder.spec()} and a base of {base_encoder.spec()}"
+                )
+            encoder.load_state_dict(base_encoder.state_dict())
+        self.base_encoder = copy.deepcopy(base_encoder).requires_grad_(False)
+        self.target_encoder = copy.deepcopy(encoder).requires_grad_(False)
+        self.forward_model = ForwardModel(encoder.features_dim, self.action_dim) if expectation == "uniform" else None
+        self.n_updates: th.Tensor
+        self.register_buffer("n_updates", th.zeros((), dtype=th.int64))
+
+    def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """Eq. 8 (and Eq. 6 for the forward model); gradients reach the encoder and the forward model alone."""
+        phi = self.encoder(batch.observations)
+        with th.no_grad():
+            psi = self.base_encoder(batch.observations)
+            phi_next = self.target_encoder(batch.next_observations)
+        terms: dict[str, th.Tensor] = {}
+        forward_loss = th.zeros((), device=phi.device)
+        if self.forward_model is None:
+            next_distance = th.cdist(phi_next, phi_next, p=1)
+            pairs = same_action_pairs(batch.actions, self.action_radius)
+        else:
+            with th.no_grad():
+                phi_target = self.target_encoder(batch.observations)
+                next_distance = self._expected_w1(phi_target)
+            pairs = th.ones_like(next_distance, dtype=th.bool)
+            forward_loss = self.forward_model.nll(phi_target, self.action_inputs(batch.actions), phi_next)
+            terms["forward_nll"] = forward_loss
+        # A state's distance to itself is zero on both sides and teaches nothing.
+        pairs = pairs & ~th.eye(len(pairs), dtype=th.bool, device=pairs.device)
+        target = action_bisim_target(th.cdist(psi, psi, p=1), next_distance, self.c)
+        distance = th.cdist(phi, phi, p=1)
+        metric_loss = LOSSES[self.distance_loss](distance[pairs], target[pairs])
+        terms |= {"metric": metric_loss, "distance": distance[pairs].mean(), "target": target[pairs].mean()}
+        return metric_loss + forward_loss, {name: term.detach() for name, term in terms.items()}
+
+    def _expected_w1(self, phi: th.Tensor) -> th.Tensor:
+        """E_a[W1] between the predictions for all pairs of a batch, (batch, batch); the actions are shared."""
+        assert self.forward_model is not None
+        actions = self._expectation_actions(phi.device)
+        total = th.zeros(len(phi), len(phi), device=phi.device)
+        for action in actions:
+            mean, std = self.forward_model(phi, action.expand(len(phi), -1))
+            if self.wasserstein == "means":
+                total += th.cdist(mean, mean, p=1)
+            else:
+                # Row by row: all pairs at once would hold batch^2 x features_dim numbers.
+                total += th.stack([w1_gaussian(m, s, mean, std) for m, s in zip(mean, std, strict=True)])
+        return total / len(actions)
+
+    def _expectation_actions(self, device: th.device) -> th.Tensor:
+        """The actions to average over, as network inputs (n, action_dim)."""
+        if self.n_actions is not None:
+            return th.eye(self.n_actions, device=device)
+        assert isinstance(self.action_space, gym.spaces.Box)
+        low, high = (th.as_tensor(k, device=device) for k in (self.action_space.low, self.action_space.high))
+        return low + (high - low) * th.rand(self.n_action_samples, self.action_dim).to(device)
+
+    @th.no_grad()
+    def after_step(self) -> None:
+        """Move the target encoder, ``phi <- tau phi_eta + (1 - tau) phi``, and reset the forward model when due."""
+        for target, online in zip(self.target_encoder.parameters(), self.encoder.parameters(), strict=True):
+            target.lerp_(online, self.tau)
+        self.n_updates += 1
+        interval = self.forward_reset_interval
+        if self.forward_model is not None and interval is not None and int(self.n_updates) % interval == 0:
+            self.forward_model.reset()

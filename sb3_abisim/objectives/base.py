@@ -1,0 +1,69 @@
+"""The contract between an objective and the training loop."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import gymnasium as gym
+import torch as th
+from torch import nn
+
+from sb3_abisim.networks import Encoder
+
+
+@dataclass(frozen=True)
+class TensorBatch:
+    """Transitions (s_t, a_t, s_{t+k}) on a device, observations already through SB3's ``preprocess_obs``.
+
+    :param observations: float (batch, channels, height, width) in 0..1
+    :param actions: a_t, int64 (batch,) for ``Discrete``, float32 (batch, action_dim) for ``Box``
+    :param next_observations: s_{t+k}, as ``observations``
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+
+
+class Objective(nn.Module):
+    """A loss and everything it trains: the encoder and its heads.
+
+    No optimiser, logging or file is known here. Whatever must survive an interruption is a parameter or a buffer.
+
+    :param encoder: the network to pretrain
+    :param action_space: ``Discrete`` (starting at 0) or one-dimensional ``Box``
+    :raises ValueError: for another action space
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, encoder: Encoder, action_space: gym.Space) -> None:
+        super().__init__()
+        discrete = isinstance(action_space, gym.spaces.Discrete) and action_space.start == 0
+        box = isinstance(action_space, gym.spaces.Box) and len(action_space.shape) == 1
+        if not (discrete or box):
+            raise ValueError(f"actions must be Discrete starting at 0 or a one-dimensional Box, got {action_space}")
+        self.encoder = encoder
+        self.action_space = action_space
+
+    @property
+    def n_actions(self) -> int | None:
+        """Number of discrete actions, None for continuous ones."""
+        return int(self.action_space.n) if isinstance(self.action_space, gym.spaces.Discrete) else None
+
+    @property
+    def action_dim(self) -> int:
+        """Size of an action as a network input: one-hot for discrete actions."""
+        return self.n_actions or int(self.action_space.shape[0])  # type: ignore[index]
+
+    def action_inputs(self, actions: th.Tensor) -> th.Tensor:
+        """Actions as network inputs, float32 (batch, action_dim)."""
+        if self.n_actions is None:
+            return actions
+        return nn.functional.one_hot(actions, self.n_actions).float()
+
+    def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """The scalar to minimise, and its named terms (detached) for the log."""
+        raise NotImplementedError
+
+    def after_step(self) -> None:
+        """Called after each optimiser step, for target networks and schedules."""

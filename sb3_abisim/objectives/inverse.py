@@ -1,0 +1,109 @@
+"""Regularised inverse dynamics (the paper's Eq. 5, L_ss): SSI for k = 1, ACRO for k > 1.
+
+====================  =======================================  ==========================================
+paper                 here                                     meaning
+====================  =======================================  ==========================================
+psi_theta             ``encoder``                              single-step encoder
+f_nu,inverse          ``inverse_model``                        weak model of p(a | psi(s), psi(s'))
+beta                  ``l1_penalty``                           weight of the L1 norm of both embeddings
+beta_max, alpha       ``l1_penalty``, ``accuracy``             adaptive regularisation (appendix)
+====================  =======================================  ==========================================
+
+Choices: losses are means over the batch where the paper writes sums over the data set. The paper's table ends the
+inverse model in a layer of 256 (Nav2D) or 32 (Pointmass) units, which is no distribution over actions; ours ends in
+one logit per action, or mean and log standard deviation per continuous action dimension. The accuracy alpha of a
+continuous prediction is taken to be its coefficient of determination, clipped to 0..1.
+"""
+
+import math
+
+import gymnasium as gym
+import torch as th
+from torch import nn
+
+from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.objectives.base import Objective, TensorBatch
+
+ADAPTIVE_FORMS = ("paper", "released")
+HIDDEN_DIM = 256
+_LOG_STD_RANGE = (-5.0, 2.0)
+
+
+def inverse_dynamics_loss(
+    log_prob: th.Tensor, psi: th.Tensor, psi_next: th.Tensor, beta: float | th.Tensor
+) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    """Eq. 5: ``-log f(a | psi(s), psi(s')) + beta (|psi(s)|_1 + |psi(s')|_1)``, mean over the batch.
+
+    :param log_prob: log-likelihood of the action taken, (batch,)
+    :param psi: embedding of s, (batch, features_dim)
+    :param psi_next: embedding of s', (batch, features_dim)
+    :param beta: weight of the penalty, at least 0
+    """
+    prediction = -log_prob.mean()
+    l1_norm = (psi.abs().sum(dim=1) + psi_next.abs().sum(dim=1)).mean()
+    return prediction + beta * l1_norm, {"prediction": prediction, "l1_norm": l1_norm}
+
+
+def adaptive_beta(beta_max: float, accuracy: th.Tensor, form: str) -> th.Tensor:
+    """The regularisation for the present accuracy: more of it once actions are predicted well.
+
+    :param beta_max: largest weight
+    :param accuracy: of the previous iteration, 0..1
+    :param form: "paper", ``beta_max (1 - exp(-4 alpha^2))``, or "released", ``beta_max exp(-5 (alpha - 1)^2)``
+    """
+    if form == "paper":
+        return beta_max * (1.0 - th.exp(-4.0 * accuracy**2))
+    return beta_max * th.exp(-5.0 * (accuracy - 1.0) ** 2)
+
+
+class InverseDynamics(Objective):
+    """Embed what is needed to tell which action led from s_t to s_{t+k}, and as little else as possible.
+
+    :param encoder: the network to pretrain
+    :param action_space: ``Discrete`` or one-dimensional ``Box``
+    :param l1_penalty: beta, or beta_max with ``adaptive``
+    :param adaptive: None for a fixed beta, else "paper" or "released" (see :func:`adaptive_beta`)
+    """
+
+    name = "ssi"
+
+    def __init__(
+        self, encoder: Encoder, action_space: gym.Space, l1_penalty: float = 1e-4, adaptive: str | None = None
+    ) -> None:
+        super().__init__(encoder, action_space)
+        if not 0 <= l1_penalty < math.inf:
+            raise ValueError(f"l1_penalty must be a number of at least 0, got {l1_penalty}")
+        if adaptive is not None and adaptive not in ADAPTIVE_FORMS:
+            raise ValueError(f"adaptive must be None or one of {ADAPTIVE_FORMS}, got {adaptive!r}")
+        self.l1_penalty = l1_penalty
+        self.adaptive = adaptive
+        n_outputs = self.n_actions or 2 * self.action_dim
+        self.inverse_model = MLP(2 * encoder.features_dim, HIDDEN_DIM, n_outputs)
+        # Accuracy of the previous iteration; a buffer, so that an interrupted run goes on with the same beta.
+        self.accuracy: th.Tensor
+        self.register_buffer("accuracy", th.zeros(()))
+
+    def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+        """Eq. 5 on a batch; terms ``prediction``, ``l1_norm``, ``beta`` and ``accuracy``."""
+        # One pass for both ends of the transition.
+        both = self.encoder(th.cat([batch.observations, batch.next_observations]))
+        psi, psi_next = both.chunk(2)
+        log_prob, accuracy = self._score(self.inverse_model(th.cat([psi, psi_next - psi], dim=1)), batch.actions)
+        beta = th.as_tensor(self.l1_penalty)
+        if self.adaptive is not None:
+            beta = adaptive_beta(self.l1_penalty, self.accuracy, self.adaptive)
+        loss, terms = inverse_dynamics_loss(log_prob, psi, psi_next, beta)
+        if self.training:
+            self.accuracy.copy_(accuracy)
+        return loss, {**{k: v.detach() for k, v in terms.items()}, "beta": beta, "accuracy": accuracy}
+
+    def _score(self, outputs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Log-likelihood of each action (batch,), and the share of correct predictions (or clipped R^2)."""
+        if self.n_actions is not None:
+            log_prob = -nn.functional.cross_entropy(outputs, actions, reduction="none")
+            return log_prob, (outputs.argmax(dim=1) == actions).float().mean()
+        mean, log_std = outputs.chunk(2, dim=1)
+        log_std = log_std.clamp(*_LOG_STD_RANGE)
+        log_prob = th.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=1)
+        unexplained = (mean - actions).pow(2).sum() / (actions - actions.mean(dim=0)).pow(2).sum()
+        return log_prob, (1.0 - unexplained).clamp(0.0, 1.0).detach()

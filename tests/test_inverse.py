@@ -1,0 +1,159 @@
+"""Eq. 5 against a loop-written derivation, its gradients, and that it learns what it must."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.objectives.base import TensorBatch
+from sb3_abisim.objectives.inverse import InverseDynamics, adaptive_beta, inverse_dynamics_loss
+
+DISCRETE = gym.spaces.Discrete(3)
+CONTINUOUS = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+
+class LineEncoder(Encoder):
+    """Vectors instead of images, for speed."""
+
+    observation_shape = (1, 1, 4)
+
+    def __init__(self, features_dim: int = 5) -> None:
+        super().__init__(nn.Sequential(nn.Flatten(), MLP(4, 16, features_dim)), features_dim, {})
+
+
+def make_batch(action_space, n=256, seed=0, noise=0.0):
+    """s is random, s' is s moved by the action along its first numbers; the other numbers are drawn anew."""
+    generator = th.Generator().manual_seed(seed)
+    s = th.rand(n, 1, 1, 4, generator=generator)
+    s_next = s.clone()
+    s_next[..., 2:] = th.rand(n, 1, 1, 2, generator=generator)
+    if isinstance(action_space, gym.spaces.Discrete):
+        actions = th.randint(0, 3, (n,), generator=generator)
+        s_next[:, 0, 0, 0] += 0.2 * (actions - 1)
+    else:
+        actions = 2 * th.rand(n, 2, generator=generator) - 1
+        s_next[:, 0, 0, :2] += 0.2 * actions
+    return TensorBatch(s, actions, s_next)
+
+
+def test_loss_equals_loop():
+    generator = th.Generator().manual_seed(1)
+    log_prob = th.rand(3, generator=generator).log()
+    psi, psi_next = (th.randn(3, 4, generator=generator) for _ in range(2))
+    expected = 0.0
+    for i in range(3):
+        expected -= float(log_prob[i])
+        for d in range(4):
+            expected += 0.7 * (abs(float(psi[i, d])) + abs(float(psi_next[i, d])))
+    loss, terms = inverse_dynamics_loss(log_prob, psi, psi_next, 0.7)
+    assert float(loss) == pytest.approx(expected / 3, rel=1e-5)
+    assert float(terms["prediction"] + 0.7 * terms["l1_norm"]) == pytest.approx(float(loss), rel=1e-5)
+
+
+@pytest.mark.parametrize("accuracy", [0.0, 0.3, 1.0])
+def test_adaptive_beta(accuracy):
+    alpha = th.tensor(accuracy)
+    assert float(adaptive_beta(2.0, alpha, "paper")) == pytest.approx(2.0 * (1 - math.exp(-4 * accuracy**2)))
+    assert float(adaptive_beta(2.0, alpha, "released")) == pytest.approx(2.0 * math.exp(-5 * (accuracy - 1) ** 2))
+
+
+@th.no_grad()
+def test_discrete_prediction_term_is_cross_entropy():
+    th.manual_seed(0)
+    objective = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.0)
+    batch = make_batch(DISCRETE, 7)
+    psi, psi_next = objective.encoder(batch.observations), objective.encoder(batch.next_observations)
+    total, hits = 0.0, 0
+    for i in range(7):
+        logits = objective.inverse_model(th.cat([psi[i], psi_next[i] - psi[i]])[None])[0]
+        exponentials = [math.exp(float(x)) for x in logits]
+        total -= math.log(exponentials[int(batch.actions[i])] / sum(exponentials))
+        hits += exponentials.index(max(exponentials)) == int(batch.actions[i])
+    loss, terms = objective.loss(batch)
+    assert float(loss) == pytest.approx(total / 7, rel=1e-4)
+    assert float(terms["accuracy"]) == pytest.approx(hits / 7)
+
+
+@th.no_grad()
+def test_continuous_prediction_term_is_gaussian():
+    th.manual_seed(0)
+    objective = InverseDynamics(LineEncoder(), CONTINUOUS, l1_penalty=0.0)
+    batch = make_batch(CONTINUOUS, 5)
+    psi, psi_next = objective.encoder(batch.observations), objective.encoder(batch.next_observations)
+    total = 0.0
+    for i in range(5):
+        out = [float(x) for x in objective.inverse_model(th.cat([psi[i], psi_next[i] - psi[i]])[None])[0]]
+        for d in range(2):
+            mean, std = out[d], math.exp(out[2 + d])
+            residual = (float(batch.actions[i, d]) - mean) / std
+            total += 0.5 * residual**2 + math.log(std) + 0.5 * math.log(2 * math.pi)
+    assert float(objective.loss(batch)[0]) == pytest.approx(total / 5, rel=1e-4)
+
+
+def test_gradients_reach_encoder_and_head():
+    objective = InverseDynamics(LineEncoder(), DISCRETE)
+    objective.loss(make_batch(DISCRETE))[0].backward()
+    assert all(float(p.grad.abs().sum()) > 0 for p in objective.parameters())
+
+
+def fit(objective, batch, n_updates=250):
+    optimizer = th.optim.Adam(objective.parameters(), lr=5e-3)
+    for _ in range(n_updates):
+        loss, _ = objective.loss(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        objective.after_step()
+    return objective.eval()
+
+
+@pytest.mark.parametrize("space", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_learns_the_action_on_unseen_transitions(space):
+    th.manual_seed(0)
+    objective = fit(InverseDynamics(LineEncoder(), space, l1_penalty=0.0), make_batch(space, 512))
+    assert float(objective.loss(make_batch(space, 512, seed=9))[1]["accuracy"]) > 0.9
+
+
+def test_penalty_makes_the_embedding_ignore_what_actions_do_not_move():
+    """Theorem 2's premise: uncontrollable numbers leave the embedding when the penalty is on, and only then."""
+    sensitivity = {}
+    for penalty in (0.0, 0.1):
+        th.manual_seed(0)
+        objective = fit(InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=penalty), make_batch(DISCRETE, 512), 500)
+        batch = make_batch(DISCRETE, 256, seed=3)
+        change = {}
+        for name, column in (("controlled", 0), ("uncontrolled", 2)):
+            moved = batch.observations.clone()
+            moved[..., column] += 0.3
+            change[name] = float((objective.encoder(moved) - objective.encoder(batch.observations)).abs().sum().detach())
+        sensitivity[penalty] = change["uncontrolled"] / change["controlled"]
+    assert sensitivity[0.1] < 0.4 * sensitivity[0.0]
+
+
+def test_adaptive_beta_follows_the_previous_accuracy():
+    objective = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.5, adaptive="paper")
+    batch = make_batch(DISCRETE)
+    first, second = objective.loss(batch)[1], objective.loss(batch)[1]
+    assert float(first["beta"]) == 0.0
+    assert float(second["beta"]) == pytest.approx(0.5 * (1 - math.exp(-4 * float(first["accuracy"]) ** 2)))
+    objective.eval()
+    before = objective.accuracy.clone()
+    objective.loss(make_batch(DISCRETE, seed=5))
+    assert objective.accuracy == before, "evaluation must not change the schedule"
+
+
+@pytest.mark.parametrize(
+    "kwargs", [{"l1_penalty": -1.0}, {"l1_penalty": math.nan}, {"adaptive": "sometimes"}], ids=str
+)
+def test_refuses_bad_settings(kwargs):
+    with pytest.raises(ValueError, match=str(next(iter(kwargs.values())))):
+        InverseDynamics(LineEncoder(), DISCRETE, **kwargs)
+
+
+def test_refuses_other_action_spaces():
+    with pytest.raises(ValueError, match="MultiBinary"):
+        InverseDynamics(LineEncoder(), gym.spaces.MultiBinary(3))

@@ -1,0 +1,107 @@
+"""Nav2D against a plain per-cell reading of its specification."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_abisim.envs.nav2d import GOAL, LAYOUTS, MOVES, Nav2DEnv, Nav2DVectorEnv
+
+IDS = ["Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0"]
+
+
+def cells(picture):
+    """Agent (x, y), obstacle set, goal (x, y) of an observation."""
+    (agent,), (goal,) = ([(int(x), int(y)) for y, x in np.argwhere(picture[c])] for c in (0, 2))
+    return agent, {(int(x), int(y)) for y, x in np.argwhere(picture[1])}, goal
+
+
+def reachable(start, obstacles):
+    found, front = {start}, [start]
+    while front:
+        x, y = front.pop()
+        for dx, dy in MOVES:
+            cell = (x + dx, y + dy)
+            if cell not in found and cell not in obstacles and 0 <= cell[0] < 15 and 0 <= cell[1] < 15:
+                found.add(cell)
+                front.append(cell)
+    return found
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_steps_follow_the_rules(env_id):
+    env = gym.make(env_id)
+    rng = np.random.default_rng(0)
+    moved, blocked, successes = 0, 0, 0
+    for episode in range(30):
+        observation, _ = env.reset(seed=episode)
+        (x, y), obstacles, goal = cells(observation)
+        assert goal == GOAL == (7, 7) and (x, y) != goal
+        for step in range(1, 51):
+            action = int(rng.integers(4))
+            dx, dy = ((0, -1), (0, 1), (-1, 0), (1, 0))[action]
+            target = (x + dx, y + dy)
+            inside = 0 <= target[0] < 15 and 0 <= target[1] < 15
+            expected = target if inside and target not in obstacles else (x, y)
+            moved, blocked = moved + (expected != (x, y)), blocked + (expected == (x, y))
+            observation, reward, terminated, truncated, info = env.step(action)
+            (x, y), now, _ = cells(observation)
+            assert ((x, y), now) == (expected, obstacles)
+            assert (reward, terminated, info["is_success"]) == ((0.0, True, True) if expected == goal else (-1.0, False, False))
+            assert truncated == (step == 50 and not terminated)
+            if terminated or truncated:
+                successes += terminated
+                break
+    assert moved > 100 and blocked > 100 and successes > 0
+
+
+def test_layouts_leave_a_path_and_hold_2x2_obstacles():
+    env = Nav2DEnv()
+    starts, counts = set(), []
+    for seed in range(300):
+        agent, obstacles, goal = cells(env.reset(seed=seed)[0])
+        starts.add(agent)
+        counts.append(len(obstacles))
+        assert goal in reachable(agent, obstacles) and agent not in obstacles and goal not in obstacles
+        for x, y in obstacles:
+            assert any({(x - i, y - j), (x + 1 - i, y - j), (x - i, y + 1 - j), (x + 1 - i, y + 1 - j)} <= obstacles
+                       for i in (0, 1) for j in (0, 1))
+    assert len(starts) > 150, "the agent starts anywhere"
+    # 20 blocks of 4 cells at random positions overlap; by simulation 66 cells are covered on average.
+    assert 60 < np.mean(counts) < 70 and max(counts) <= 80
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_fixed_structures(layout):
+    env = Nav2DEnv(layout=layout)
+    structure = {(x, y): c for y, row in enumerate(LAYOUTS[layout]) for x, c in enumerate(row)}
+    shown = []
+    for seed in range(20):
+        agent, obstacles, _ = cells(env.reset(seed=seed)[0])
+        assert reachable(agent, obstacles) == {cell for cell, c in structure.items() if c == "."}
+        assert {cell for cell, c in structure.items() if c == "#"} <= obstacles
+        shown.append(frozenset(obstacles))
+    assert len(set(shown)) > 15, "the obstacles that cannot be reached are drawn anew"
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_render_shows_the_agent(env_id):
+    env = gym.make(env_id, render_mode="rgb_array")
+    agent = cells(env.reset(seed=3)[0])[0]
+    frame = env.render()
+    assert frame.shape == (480, 480, 3) and frame.dtype == np.uint8
+    red = (frame.astype(int) @ (2, -1, -1)) > 150
+    assert tuple(np.argwhere(red).mean(axis=0) // 32) == agent[::-1]
+
+
+def test_factors_describe_the_observation():
+    batch = Nav2DVectorEnv(num_envs=3)
+    observations, _ = batch.reset(seed=0)
+    factors = batch.factors()
+    for observation, agent, obstacles in zip(observations, factors["agent"], factors["obstacles"], strict=True):
+        assert cells(observation)[0] == tuple(agent)
+        assert np.array_equal(observation[1] > 0, obstacles)
+
+
+def test_unknown_layout():
+    with pytest.raises(ValueError, match="spiral"):
+        Nav2DEnv(layout="spiral")

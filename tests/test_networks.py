@@ -1,0 +1,58 @@
+"""The encoders have the sizes that the paper gives, see -1..1, and are rebuilt from their specs."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_abisim.networks import ENCODERS, make_encoder
+
+
+def image_space(*shape):
+    return gym.spaces.Box(0, 255, shape, np.uint8)
+
+
+@pytest.mark.parametrize(("shape", "features_dim"), [((3, 15, 15), 576), ((3, 64, 64), 32)])
+def test_paper_sizes(shape, features_dim):
+    encoder = make_encoder(image_space(*shape))
+    assert encoder(th.rand(2, *shape)).shape == (2, features_dim) and encoder.features_dim == features_dim
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_spec_rebuilds_the_network(name):
+    shape = ENCODERS[name].observation_shape
+    encoder = make_encoder(image_space(*shape), name)
+    spec = encoder.spec()
+    again = make_encoder(image_space(*shape), spec["name"], **spec["kwargs"])
+    again.load_state_dict(encoder.state_dict())
+    x = th.rand(2, *shape)
+    assert th.equal(encoder(x), again(x))
+
+
+def test_inputs_are_mapped_to_plus_minus_one():
+    encoder = make_encoder(image_space(3, 15, 15))
+    seen = []
+    encoder.layers.register_forward_pre_hook(lambda module, args: seen.append(args[0]))
+    encoder(th.tensor([0.0, 0.5, 1.0]).repeat_interleave(225).reshape(1, 3, 15, 15))
+    assert seen[0][0, :, 4, 4].tolist() == [-1.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "name", "kwargs", "message"),
+    [
+        ((3, 20, 20), None, {}, "no default encoder"),
+        ((3, 64, 64), "ResNet", {}, "ResNet"),
+        ((3, 64, 64), "PointMazeEncoder", {"width": 3}, "width"),
+        ((3, 15, 15), "PointMazeEncoder", {}, "shape"),
+        ((4, 64, 64), "PointMazeEncoder", {}, "shape"),
+    ],
+    ids=str,
+)
+def test_refuses(shape, name, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_encoder(image_space(*shape), name, **kwargs)
+
+
+def test_other_channel_counts():
+    encoder = make_encoder(image_space(4, 64, 64), "PointMazeEncoder", n_input_channels=4, features_dim=7)
+    assert encoder(th.rand(1, 4, 64, 64)).shape == (1, 7)
