@@ -126,6 +126,20 @@ def test_w1_gaussian_equals_numerical_transport(seed):
     assert float(actual) == pytest.approx(expected, rel=1e-3)
 
 
+def test_pairs_are_different_transitions_with_the_same_action():
+    objective, actions = make(expectation="behaviour", n_pairs=5), th.tensor([0, 1, 0, 1, 1, 0, 0])
+    seen = set()
+    for _ in range(50):
+        i, j = objective._sample_pairs(actions)
+        assert len(i) == 5 and bool((actions[i] == actions[j]).all())
+        drawn = {frozenset(pair) for pair in zip(i.tolist(), j.tolist(), strict=True)}
+        assert len(drawn) == 5 and all(len(pair) == 2 for pair in drawn)
+        seen |= drawn
+    assert len(seen) == 6 + 3, "every pair with equal actions gets its turn"
+    with pytest.raises(ValueError, match="same action"):
+        objective._sample_pairs(th.tensor([0, 1]))
+
+
 def test_same_action_pairs_of_continuous_actions():
     actions = th.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 0.5]])
     expected = [[True, True, False], [True, True, False], [False, False, True]]
@@ -231,6 +245,7 @@ def test_converges_to_the_metric_of_a_chain(expectation):
     ("kwargs", "message"),
     [
         ({"c": 1.0}, "c must lie"),
+        ({"n_pairs": 0}, "n_pairs"),
         ({"c": -0.1}, "c must lie"),
         ({"tau": 0.0}, "tau"),
         ({"expectation": "both"}, "both"),

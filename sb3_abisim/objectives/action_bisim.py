@@ -11,8 +11,8 @@ c                     ``c``                           weight of the recursive st
 tau                   ``tau``                         rate of the moving average
 ====================  ==============================  =====================================================
 
-Every pair of states of a batch is used, where the paper samples pairs: the distances between n embeddings cost little
-beside the n embeddings. Two expectations over actions are offered:
+Pairs of states are drawn among those of a batch, many more of them than states: distances between n embeddings cost
+little beside the n embeddings. Two expectations over actions are offered:
 
 * ``expectation="uniform"``: the forward model predicts the next embedding for all discrete actions, or for
   ``n_action_samples`` uniform continuous ones, the same for both states (Eq. 7).
@@ -51,6 +51,11 @@ def action_bisim_target(base_distance: th.Tensor, next_distance: th.Tensor, c: f
     :param c: 0 <= c < 1
     """
     return (1.0 - c) * base_distance + c * next_distance
+
+
+def l1_distance(x: th.Tensor, y: th.Tensor) -> th.Tensor:
+    """L1 distances of embeddings, (n, features_dim) each, as (n,)."""
+    return (x - y).abs().sum(dim=1)
 
 
 def w1_gaussian(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: th.Tensor) -> th.Tensor:
@@ -119,6 +124,7 @@ class ActionBisimulation(Objective):
     :param expectation: "uniform" or "behaviour" (module docstring)
     :param distance_loss: "l1" (the paper), "smooth_l1" (the released code) or "mse"
     :param wasserstein: "means" or "gaussian", which also counts the predicted variance (:func:`w1_gaussian`)
+    :param n_pairs: pairs of states per update
     :param n_action_samples: continuous actions per update for "uniform"
     :param action_radius: see :func:`same_action_pairs`, for continuous "behaviour"
     :param warm_start: begin from the base encoder's weights, if it is the same network
@@ -137,6 +143,7 @@ class ActionBisimulation(Objective):
         expectation: str = "uniform",
         distance_loss: str = "l1",
         wasserstein: str = "means",
+        n_pairs: int = 4096,
         n_action_samples: int = 8,
         action_radius: float = 0.2,
         warm_start: bool = False,
@@ -156,6 +163,10 @@ class ActionBisimulation(Objective):
             raise ValueError(f"forward_reset_interval must be at least 1 or None, got {forward_reset_interval}")
         self.c, self.tau = c, tau
         self.expectation, self.distance_loss, self.wasserstein = expectation, distance_loss, wasserstein
+        for name, count in (("n_pairs", n_pairs), ("n_action_samples", n_action_samples)):
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, got {count}")
+        self.n_pairs = n_pairs
         self.n_action_samples, self.action_radius = n_action_samples, action_radius
         self.forward_reset_interval = forward_reset_interval
         if warm_start:
@@ -172,6 +183,7 @@ class ActionBisimulation(Objective):
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """Eq. 8 (and Eq. 6 for the forward model); gradients reach the encoder and the forward model alone."""
+        i, j = self._sample_pairs(batch.actions)
         phi = self.encoder(batch.observations)
         with th.no_grad():
             psi = self.base_encoder(batch.observations)
@@ -179,35 +191,47 @@ class ActionBisimulation(Objective):
         terms: dict[str, th.Tensor] = {}
         forward_loss = th.zeros((), device=phi.device)
         if self.forward_model is None:
-            next_distance = th.cdist(phi_next, phi_next, p=1)
-            pairs = same_action_pairs(batch.actions, self.action_radius)
+            next_distance = l1_distance(phi_next[i], phi_next[j])
         else:
             with th.no_grad():
                 phi_target = self.target_encoder(batch.observations)
-                next_distance = self._expected_w1(phi_target)
-            pairs = th.ones_like(next_distance, dtype=th.bool)
+                next_distance = self._expected_w1(phi_target, i, j)
             forward_loss = self.forward_model.nll(phi_target, self.action_inputs(batch.actions), phi_next)
             terms["forward_nll"] = forward_loss
-        # A state's distance to itself is zero on both sides and teaches nothing.
-        pairs = pairs & ~th.eye(len(pairs), dtype=th.bool, device=pairs.device)
-        target = action_bisim_target(th.cdist(psi, psi, p=1), next_distance, self.c)
-        distance = th.cdist(phi, phi, p=1)
-        metric_loss = LOSSES[self.distance_loss](distance[pairs], target[pairs])
-        terms |= {"metric": metric_loss, "distance": distance[pairs].mean(), "target": target[pairs].mean()}
+        target = action_bisim_target(l1_distance(psi[i], psi[j]), next_distance, self.c)
+        distance = l1_distance(phi[i], phi[j])
+        metric_loss = LOSSES[self.distance_loss](distance, target)
+        terms |= {"metric": metric_loss, "distance": distance.mean(), "target": target.mean()}
         return metric_loss + forward_loss, {name: term.detach() for name, term in terms.items()}
 
-    def _expected_w1(self, phi: th.Tensor) -> th.Tensor:
-        """E_a[W1] between the predictions for all pairs of a batch, (batch, batch); the actions are shared."""
+    def _sample_pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Indices of ``n_pairs`` different pairs of transitions (all, if there are fewer), each (n_pairs,)."""
+        n = len(actions)
+        if self.expectation == "behaviour":
+            allowed = same_action_pairs(actions, self.action_radius)
+        else:
+            allowed = th.ones(n, n, dtype=th.bool, device=actions.device)
+        # Distances are symmetric, and a state's distance to itself is zero on both sides and teaches nothing.
+        pairs = allowed.triu(diagonal=1).nonzero()
+        if len(pairs) == 0:
+            raise ValueError(
+                f"no two of the batch's {n} transitions took the same action; set a larger batch_size or action_radius"
+            )
+        chosen = th.randperm(len(pairs))[: self.n_pairs].to(actions.device)
+        i, j = pairs[chosen].unbind(dim=1)
+        return i, j
+
+    def _expected_w1(self, phi: th.Tensor, i: th.Tensor, j: th.Tensor) -> th.Tensor:
+        """E_a[W1] between the predictions for pairs of a batch, (n_pairs,); both states take the same actions."""
         assert self.forward_model is not None
         actions = self._expectation_actions(phi.device)
-        total = th.zeros(len(phi), len(phi), device=phi.device)
+        total = th.zeros(len(i), device=phi.device)
         for action in actions:
             mean, std = self.forward_model(phi, action.expand(len(phi), -1))
             if self.wasserstein == "means":
-                total += th.cdist(mean, mean, p=1)
+                total += l1_distance(mean[i], mean[j])
             else:
-                # Row by row: all pairs at once would hold batch^2 x features_dim numbers.
-                total += th.stack([w1_gaussian(m, s, mean, std) for m, s in zip(mean, std, strict=True)])
+                total += w1_gaussian(mean[i], std[i], mean[j], std[j])
         return total / len(actions)
 
     def _expectation_actions(self, device: th.device) -> th.Tensor:

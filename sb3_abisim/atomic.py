@@ -1,0 +1,119 @@
+"""Files that are either whole or absent, and folders with one writer at a time.
+
+A process may be killed between any two instructions. :func:`write_atomic` therefore writes under a temporary name and
+renames at the end; a reader sees the old file or the new one. :func:`folder_lock` rests on ``flock``, which the kernel
+releases when its holder dies, so that a kill leaves nothing to clean up by hand.
+"""
+
+import contextlib
+import hashlib
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+LOCK_NAME = ".lock"
+_TEMPORARY_SUFFIX = ".tmp"
+
+
+class FolderLockedError(ValueError):
+    """Another process is writing in the folder; the message names its pid and host."""
+
+
+def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], object], size: int | None = None) -> None:
+    """Create or replace a file so that a kill or a full disk leaves the old one (or none), never a part of the new one.
+
+    The parent folder must exist. When this returns, the file and its name have reached the disk.
+
+    :param path: the file
+    :param write_fn: called with a binary file open for writing; writes the content
+    :param size: bytes to reserve before writing, so that a full disk is found out at once; None reserves nothing.
+        It must not exceed what ``write_fn`` writes
+    :raises OSError: what the system says, ``errno.ENOSPC`` for a full disk; the temporary file is removed
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{_TEMPORARY_SUFFIX}")
+    try:
+        with open(temporary, "wb") as file:
+            if size and hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, size)
+            write_fn(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    fsync_folder(path.parent)
+
+
+def fsync_folder(path: str | os.PathLike[str]) -> None:
+    """Make the names in a folder (files created, renamed or removed) durable."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def is_temporary(name: str) -> bool:
+    """Whether a file name is one that :func:`write_atomic` uses before the rename."""
+    return name.startswith(".") and name.endswith(_TEMPORARY_SUFFIX)
+
+
+def remove_temporaries(folder: str | os.PathLike[str]) -> None:
+    """Remove what killed calls of :func:`write_atomic` left in a folder; call it only while holding its lock."""
+    for path in Path(folder).iterdir():
+        if is_temporary(path.name):
+            path.unlink()
+
+
+@contextlib.contextmanager
+def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold the right to write in a folder for the duration of a ``with`` block.
+
+    The lock file ``.lock`` is removed at the end; one left by a killed process is taken over.
+
+    :param path: an existing folder
+    :raises FolderLockedError: at once, if another process (or another block of this one) holds the lock
+    """
+    import fcntl  # POSIX only; reading data must work without it
+
+    folder = Path(path)
+    lock_path = folder / LOCK_NAME
+    while True:
+        descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.pread(descriptor, 1000, 0).decode(errors="replace") or "another process"
+            os.close(descriptor)
+            raise FolderLockedError(
+                f"{folder} is being written by {holder}; wait for it to end, stop it, or choose another folder"
+            ) from None
+        # A holder removes the file when it ends: what was just locked may no longer be what the name stands for.
+        if _is_same_file(descriptor, lock_path):
+            break
+        os.close(descriptor)
+    try:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()} on host {socket.gethostname()}".encode(), 0)
+        yield
+    finally:
+        lock_path.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _is_same_file(descriptor: int, path: Path) -> bool:
+    try:
+        there = os.stat(path)
+    except FileNotFoundError:
+        return False
+    return os.path.samestat(os.fstat(descriptor), there)
+
+
+def file_digest(path: str | os.PathLike[str]) -> str:
+    """The sha256 of a file's content in hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,40 @@
+"""What an RL run says about its encoder."""
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_abisim.extractors import find_extractors, require_weights
+
+
+class EncoderCallback(BaseCallback):
+    """States the encoders when training starts, refuses to train without their weights, and logs their drift.
+
+    Also states the fingerprint of the clips that the training environment shows, if it has one. Logs ``encoder/drift``
+    at the end of each rollout: how far the weights have moved from those that training started with, relative to the
+    norm of the latter (the largest value, where actor and critic have encoders of their own).
+
+    :param verbose: as in Stable-Baselines3
+    :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
+    """
+
+    def _on_training_start(self) -> None:
+        require_weights(self.model)
+        self._extractors = [extractor for _, extractor in find_extractors(self.model.policy)]
+        for name, extractor in find_extractors(self.model.policy):
+            origin = f"sha256 {extractor.digest}" if extractor.digest else "random weights"
+            state = "frozen" if extractor.frozen else "trained along"
+            print(
+                f"Encoder {name}: {type(extractor).__name__}, source {extractor.source}, {origin}, "
+                f"{extractor.n_parameters} parameters, {state}"
+            )
+        if not self._extractors:
+            print("Encoder: none of sb3_abisim's, policy_kwargs names another features extractor")
+        if self.training_env.has_attr("fingerprint"):
+            (fingerprint,) = self.training_env.get_attr("fingerprint", indices=0)
+            print(f"Backgrounds of the training environment: {fingerprint}")
+
+    def _on_rollout_end(self) -> None:
+        if self._extractors:
+            self.logger.record("encoder/drift", max(extractor.drift() for extractor in self._extractors))
+
+    def _on_step(self) -> bool:
+        return True

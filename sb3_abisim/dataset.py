@@ -1,0 +1,270 @@
+"""Reads datasets: memory-mapped transitions (s_t, a_t, s_{t+k}) that never cross an episode's end.
+
+Nothing that grows with the pictures is loaded; per frame, the reader keeps 5 bytes plus the size of an action.
+"""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_abisim.atomic import file_digest
+from sb3_abisim.dataset_format import (
+    CONFIG_NAME,
+    CUT,
+    INSIDE,
+    META_NAME,
+    DatasetError,
+    array_file,
+    array_layout,
+    check_meta,
+    from_json_file,
+    space_from_json,
+)
+
+# Above this size, opening a dataset compares sizes only; TransitionDataset(path, verify=True) compares hashes too.
+VERIFY_BELOW_BYTES = 4 * 10**9
+# Files whose hash this process has found right: (path, size, time of the last change, sha256).
+_VERIFIED: set[tuple[str, int, int, str]] = set()
+# Which segments are held out is a property of the dataset, not of a run.
+_HOLDOUT_SEED = 20240229
+
+Part = Literal["train", "test"]
+
+
+@dataclass(frozen=True)
+class TransitionBatch:
+    """B transitions in shuffled order.
+
+    :param observations: s_t, uint8 [B, C, H, W], in 0..255
+    :param actions: a_t, int64 [B] or float32 [B, A]
+    :param next_observations: s_{t+k}, uint8 [B, C, H, W]
+    """
+
+    observations: NDArray[np.uint8]
+    actions: NDArray[Any]
+    next_observations: NDArray[np.uint8]
+
+
+class TransitionDataset:
+    """A finished dataset folder, larger than memory if need be.
+
+    A frame index counts the frames of all shards, in order. Pickling (for worker processes) sends the path only.
+
+    :param path: the folder
+    :param holdout: share of the segments (episodes and cut episodes) that make up ``part="test"``, in [0, 1)
+    :param verify: True compares every file with its sha256, False only sizes; None does so once per process for
+        datasets below ``VERIFY_BELOW_BYTES``
+    :raises DatasetError: if the folder is not a finished dataset, or is damaged
+    """
+
+    def __init__(self, path: str | os.PathLike[str], holdout: float = 0.05, verify: bool | None = None) -> None:
+        if not 0 <= holdout < 1:
+            raise ValueError(f"holdout must be in [0, 1), got {holdout}")
+        self.path = Path(path)
+        self.holdout = holdout
+        self.meta = _read_meta(self.path)
+        self.digest: str = self.meta["digest"]
+        self.env_id: str = self.meta["env_id"]
+        self.env_kwargs: dict[str, Any] = self.meta["env_kwargs"]
+        self.n_transitions: int = self.meta["n_transitions"]
+        self.n_frames: int = self.meta["n_frames"]
+        self.observation_space: spaces.Box = space_from_json(self.meta["observation_space"])  # type: ignore[assignment]
+        self.action_space = space_from_json(self.meta["action_space"])
+        self._check_files(verify)
+        frames_per_shard = [shard["n_frames"] for shard in self.meta["shards"]]
+        # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
+        self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
+        self._maps: dict[tuple[str, int], NDArray[Any]] = {}
+        n_shards = len(frames_per_shard)
+        self._actions = np.concatenate([self._shard("actions", k) for k in range(n_shards)])
+        self._ends = np.concatenate([self._shard("ends", k) for k in range(n_shards)])
+        self._last = np.flatnonzero(self._ends != INSIDE)  # the last frame of each segment
+        self._check_ends()
+        self._remaining = self._make_remaining()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path, self.holdout, False)
+
+    @property
+    def ends(self) -> NDArray[np.uint8]:
+        """Per frame: 0 within a segment, and on its last frame 1 terminated, 2 truncated, 3 cut by a shard's end."""
+        return self._ends.copy()
+
+    def valid_starts(self, k: int = 1, part: Part | None = None) -> NDArray[np.int64]:
+        """The frames t for which frame t + k belongs to the same episode, ascending.
+
+        :param k: steps, at least 1
+        :param part: "test" for the held-out segments, "train" for the others, None for all
+        :raises ValueError: if there is none
+        """
+        if k < 1:
+            raise ValueError(f"k must be at least 1, got {k}")
+        if part not in (None, "train", "test"):
+            raise ValueError(f"part must be 'train', 'test' or None, got {part!r}")
+        longest = int(self._remaining.max())
+        if k > longest:
+            raise ValueError(f"no episode of {self.path} has k = {k} steps, the longest has {longest}; lower k")
+        valid = self._remaining >= k
+        if part is not None:
+            valid &= self._held_out() == (part == "test")
+        starts = np.flatnonzero(valid)
+        if not len(starts):
+            raise ValueError(
+                f"no transition of {k} steps in part {part!r} of {self.path} ({len(self._last)} segments, holdout "
+                f"{self.holdout}); collect more transitions or use part=None"
+            )
+        return starts
+
+    def frames(self, index: Any) -> NDArray[np.uint8]:
+        """Frames at the given indices.
+
+        :param index: integers [m] in 0..n_frames - 1
+        :return: uint8 [m, C, H, W], a copy
+        :raises IndexError: for an index out of range
+        """
+        return self._gather("frames", self._check_index(index))
+
+    def actions(self, index: Any) -> NDArray[Any]:
+        """Actions taken at the given frames, int64 [m] or float32 [m, A]; zero at a segment's last frame."""
+        return self._actions[self._check_index(index)]
+
+    def factors(self, index: Any) -> dict[str, NDArray[Any]]:
+        """The simulator's state behind the given frames: name to [m, ...]; for probes, never for a loss."""
+        index = self._check_index(index)
+        return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
+
+    def batches(
+        self, batch_size: int, k: int = 1, seed: int = 0, epoch: int = 0, start: int = 0, part: Part | None = None
+    ) -> Iterator[TransitionBatch]:
+        """One shuffled pass over all valid starts; the last, incomplete batch is dropped.
+
+        The order is a function of (seed, epoch) alone, so that a position in training is two integers.
+
+        :param batch_size: transitions per batch
+        :param k: steps between the two observations
+        :param seed: of the order
+        :param epoch: which pass
+        :param start: batches to skip
+        :param part: see :meth:`valid_starts`
+        :raises ValueError: if there are fewer transitions than one batch takes
+        """
+        if batch_size < 1 or start < 0:
+            raise ValueError(f"batch_size must be at least 1 and start at least 0, got {batch_size} and {start}")
+        starts = self.valid_starts(k, part)
+        if len(starts) < batch_size:
+            raise ValueError(f"batch_size {batch_size} exceeds the {len(starts)} transitions of {k} steps; lower it")
+        # Drawn now and not at the first batch, so that mistakes raise here.
+        order = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch]))).permutation(len(starts))
+        return self._iterate(starts[order], batch_size, k, start)
+
+    def _iterate(self, starts: NDArray[np.int64], batch_size: int, k: int, start: int) -> Iterator[TransitionBatch]:
+        for i in range(start, len(starts) // batch_size):
+            index = starts[i * batch_size : (i + 1) * batch_size]
+            # Both frames of a pair lie close together on disk: one gather reads each page once.
+            both = self._gather("frames", np.concatenate([index, index + k]))
+            yield TransitionBatch(both[:batch_size], self._actions[index], both[batch_size:])
+
+    def _check_index(self, index: Any) -> NDArray[np.int64]:
+        array = np.asarray(index)
+        if array.ndim != 1 or (array.dtype.kind not in "iu" and array.size):
+            raise IndexError(f"indices must be one-dimensional integers, got {array.dtype} of shape {array.shape}")
+        bad = array[(array < 0) | (array >= self.n_frames)]
+        if bad.size:
+            raise IndexError(f"frame index {bad[0]} is out of range, the dataset has {self.n_frames} frames")
+        return array.astype(np.int64)
+
+    def _gather(self, name: str, index: NDArray[np.int64]) -> NDArray[Any]:
+        dtype, row_shape = array_layout(self.meta, name)
+        out = np.empty((len(index), *row_shape), dtype)
+        order = np.argsort(index)
+        ascending = index[order]
+        bounds = np.searchsorted(ascending, self._offsets)
+        for shard in np.flatnonzero(np.diff(bounds)):
+            here = slice(bounds[shard], bounds[shard + 1])
+            out[order[here]] = self._shard(name, int(shard))[ascending[here] - self._offsets[shard]]
+        return out
+
+    def _shard(self, name: str, shard: int) -> NDArray[Any]:
+        """One array of a shard, memory-mapped at its first use."""
+        if (name, shard) not in self._maps:
+            path = self.path / array_file(name, shard)
+            dtype, row_shape = array_layout(self.meta, name)
+            try:
+                array = np.load(path, mmap_mode="r", allow_pickle=False).view(np.ndarray)
+            except ValueError as error:
+                raise DatasetError(f"{path} is not an array file of ours: {error}") from None
+            expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
+            if array.dtype != dtype or array.shape != expected:
+                raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
+            self._maps[name, shard] = array
+        return self._maps[name, shard]
+
+    def _make_remaining(self) -> NDArray[np.int32]:
+        """Steps from each frame to the last of its segment."""
+        lengths = np.diff(self._last, prepend=-1)
+        return (np.repeat(self._last, lengths) - np.arange(self.n_frames)).astype(np.int32)
+
+    def _held_out(self) -> NDArray[np.bool_]:
+        """Per frame, whether its segment belongs to the test part."""
+        n_segments = len(self._last)
+        n_test = min(n_segments - 1, max(1, round(self.holdout * n_segments))) if self.holdout else 0
+        chosen = np.zeros(n_segments, dtype=bool)
+        chosen[np.random.Generator(np.random.PCG64(_HOLDOUT_SEED)).permutation(n_segments)[:n_test]] = True
+        return np.repeat(chosen, np.diff(self._last, prepend=-1))
+
+    def _check_files(self, verify: bool | None) -> None:
+        entries = {name: entry for shard in self.meta["shards"] for name, entry in shard["files"].items()}
+        small = sum(entry["bytes"] for entry in entries.values()) < VERIFY_BELOW_BYTES
+        for name, entry in entries.items():
+            path = self.path / name
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                raise DatasetError(f"{path} is missing; {_repair(self.path, self.meta)}") from None
+            if status.st_size != entry["bytes"]:
+                raise DatasetError(
+                    f"{path} has {status.st_size} bytes instead of {entry['bytes']}; {_repair(self.path, self.meta)}"
+                )
+            key = (str(path.resolve()), status.st_size, status.st_mtime_ns, entry["sha256"])
+            if verify is False or (verify is None and (not small or key in _VERIFIED)):
+                continue
+            if file_digest(path) != entry["sha256"]:
+                raise DatasetError(f"{path} is damaged (sha256 does not match); {_repair(self.path, self.meta)}")
+            _VERIFIED.add(key)
+
+    def _check_ends(self) -> None:
+        shard_ends = self._offsets[1:] - 1
+        fits = self.n_frames == self._offsets[-1] == self.n_transitions + len(self._last)
+        if not fits or self._ends.max() > CUT or (self._ends[shard_ends] == INSIDE).any():
+            raise DatasetError(f"the episode ends of {self.path} contradict its meta.json; it was not written by us")
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    if not path.is_dir():
+        raise DatasetError(f"{path} is not a folder; collect a dataset with python -m sb3_abisim.collect")
+    if not (path / META_NAME).exists():
+        if (path / CONFIG_NAME).exists():
+            raise DatasetError(f"{path} is unfinished (no {META_NAME}); run the command that began it again")
+        raise DatasetError(f"{path} is not a dataset (no {META_NAME}); make one with python -m sb3_abisim.collect")
+    meta = from_json_file(path / META_NAME)
+    try:
+        check_meta(meta)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DatasetError(f"{path / META_NAME} is damaged or not ours: {error}") from None
+    return meta
+
+
+def _repair(path: Path, meta: dict[str, Any]) -> str:
+    if meta["source"] is not None:
+        return f"import it again from Minari ({meta['source']})"
+    return (
+        "run the command that collected it again, which collects damaged shards anew: python -m sb3_abisim.collect "
+        f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} -o {path}"
+        + ("" if not meta["env_kwargs"] else " with its --env-kwargs")
+    )

@@ -1,0 +1,299 @@
+"""PointMaze: a ball pushed through random obstacles to the centre of a room, seen from above as pixels."""
+
+from typing import Any
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from sb3_abisim.envs import top_down
+from sb3_abisim.envs.base import BatchEnv, SingleEnv
+from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE
+
+PIXELS_PER_METRE = 4
+ROOM_SIZE = 15.0  # m, between the walls
+WALL_PIXELS = 2
+N_OBSTACLES = 20
+OBSTACLE_PIXELS = 8
+GOAL_RADIUS = 1.0  # m
+GOAL_MARK_PIXELS = 4
+
+# The point body of gymnasium-robotics (assets/point/point.xml); a test compares the two.
+BALL_RADIUS = 0.1  # m
+TIMESTEP = 0.01  # s
+GEAR = 100.0  # N
+DAMPING = 1.0
+FRICTION = 0.5
+MAX_VELOCITY = 5.0  # m/s per axis
+SUBSTEPS = 30
+
+# From rest no velocity is above MAX_VELOCITY before any of this many substeps, so that clipping would change nothing:
+# an obstacle that the ball has dented pushes it out at 1.5 m/s at most, and a push adds 0.24 m/s per substep.
+_UNCLIPPED_SUBSTEPS = 16
+_FASTEST = np.array(MAX_VELOCITY)
+
+_N_WALLS = 4
+_CENTRE = IMAGE_SIZE // 2
+
+
+def to_pixels(positions: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Positions (x, y) in metres, shape (..., 2), as (column, row) in pixels."""
+    return positions * np.float64(PIXELS_PER_METRE) + _CENTRE
+
+
+def to_metres(pixels: NDArray[Any]) -> NDArray[np.float64]:
+    """(column, row) in pixels, shape (..., 2), as positions (x, y) in metres."""
+    return (pixels - _CENTRE) / PIXELS_PER_METRE
+
+
+# The layout of an episode, computed on bitboards: bit 64 * row + column of a Python int is a pixel.
+
+_STRIDE = IMAGE_SIZE
+
+
+def _square(column: int, row: int, side: int) -> int:
+    line = ((1 << side) - 1) << column
+    return sum(line << (_STRIDE * r) for r in range(row, row + side))
+
+
+def _unpack(board: int) -> NDArray[np.bool_]:
+    """The pixels of a bitboard, shape (64, 64)."""
+    raw = np.frombuffer(board.to_bytes(IMAGE_SIZE**2 // 8, "little"), dtype=np.uint8)
+    return np.unpackbits(raw, bitorder="little").view(np.bool_).reshape(IMAGE_SIZE, IMAGE_SIZE)
+
+
+def _corner_choices() -> NDArray[np.int64]:
+    """Every allowed (column, row) of an obstacle's top left pixel."""
+    corners = np.arange(WALL_PIXELS, IMAGE_SIZE - WALL_PIXELS - OBSTACLE_PIXELS + 1)
+    reach = int(GOAL_RADIUS * PIXELS_PER_METRE)
+    at_goal = (corners > _CENTRE - reach - OBSTACLE_PIXELS) & (corners < _CENTRE + reach)
+    return corners[np.argwhere(~(at_goal[:, None] & at_goal))]
+
+
+def _start_blocks() -> int:
+    """The 2 x 2 blocks around whose centre no position within half a pixel per axis is at the goal."""
+    offset = np.maximum(np.abs(np.arange(IMAGE_SIZE) + 1 - _CENTRE) - 0.5, 0.0)
+    outside = np.hypot(offset[:, None], offset) > GOAL_RADIUS * PIXELS_PER_METRE
+    return int.from_bytes(np.packbits(outside, bitorder="little").tobytes(), "little")
+
+
+_OBSTACLE = _square(0, 0, OBSTACLE_PIXELS)
+_FULL = (1 << IMAGE_SIZE**2) - 1
+_WALLS = _FULL & ~_square(WALL_PIXELS, WALL_PIXELS, IMAGE_SIZE - 2 * WALL_PIXELS)
+# A corridor is made of 2 x 2 pixels of free floor, named by their top left one; this one is the goal's.
+_GOAL_BLOCK = _square(_CENTRE - 1, _CENTRE - 1, 1)
+_CORNERS = _corner_choices()
+_START_BLOCKS = _start_blocks()
+
+_WALL_MASK = _unpack(_WALLS)
+_GOAL_MASK = _unpack(_square(_CENTRE - GOAL_MARK_PIXELS // 2, _CENTRE - GOAL_MARK_PIXELS // 2, GOAL_MARK_PIXELS))
+_EMPTY_LAYER = top_down.floor(IMAGE_SIZE)
+top_down.paint(_EMPTY_LAYER, _WALL_MASK, top_down.WALL)
+top_down.paint(_EMPTY_LAYER, _GOAL_MASK, top_down.GOAL)
+
+
+def _connected(blocks: int, start: int, goal: int) -> bool:
+    """Whether shifts by one pixel within ``blocks`` lead from ``start`` to ``goal``."""
+    reached = goal & blocks
+    while not reached & start:
+        grown = (reached | reached << 1 | reached >> 1 | reached << _STRIDE | reached >> _STRIDE) & blocks
+        if grown == reached:
+            return False
+        reached = grown
+    return True
+
+
+def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], int, NDArray[np.float64]]:
+    """Draw the obstacles and the start of an episode, until a corridor 0.5 m wide joins start and goal.
+
+    :return: (column, row) of the obstacles' top left pixels, shape (20, 2); the bitboard of obstacles and walls; the
+        start (x, y) in metres
+    """
+    while True:
+        corners = _CORNERS[generator.integers(len(_CORNERS), size=N_OBSTACLES)]
+        occupied = _WALLS
+        for column, row in corners.tolist():
+            occupied |= _OBSTACLE << (_STRIDE * row + column)
+        free = _FULL & ~occupied
+        blocks = free & free >> 1 & free >> _STRIDE & free >> (_STRIDE + 1)
+        choices = np.flatnonzero(_unpack(blocks & _START_BLOCKS))
+        if not len(choices):
+            continue
+        block = int(choices[generator.integers(len(choices))])
+        jitter = generator.uniform(-0.5, 0.5, size=2)
+        if _connected(blocks, 1 << block, _GOAL_BLOCK):
+            row, column = divmod(block, _STRIDE)
+            return corners, occupied, to_metres(np.array([column + 1, row + 1]) + jitter)
+
+
+def _static_layer(occupied: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The picture without agent (3, 64, 64), and the mask (64, 64) of everything in it that is not floor."""
+    layer = _EMPTY_LAYER.copy()
+    solid = _unpack(occupied)
+    top_down.paint(layer, solid & ~_WALL_MASK, top_down.OBSTACLE)
+    return layer, solid | _GOAL_MASK
+
+
+def point_model() -> mujoco.MjModel:
+    """The room with its walls, obstacles (placed per simulation through ``geom_pos``) and the ball."""
+    half, thick, box = ROOM_SIZE / 2, WALL_PIXELS / PIXELS_PER_METRE / 2, OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
+    boxes = [(side * (half + thick), 0.0, thick, half) for side in (-1, 1)]
+    boxes += [(0.0, side * (half + thick), half + 2 * thick, thick) for side in (-1, 1)]
+    # Compiled away from the origin: MuJoCo takes a geom compiled at its body's frame to stay there (geom_sameframe).
+    boxes += [(1.0, 1.0, box, box)] * N_OBSTACLES
+    geoms = "".join(f'<geom type="box" pos="{x} {y} 0" size="{a} {b} {thick}"/>' for x, y, a, b in boxes)
+    axes = "".join(f'<joint name="{n}" type="slide" axis="{a}"/>' for n, a in (("x", "1 0 0"), ("y", "0 1 0")))
+    motors = "".join(f'<motor joint="{n}" gear="{GEAR}" ctrllimited="true" ctrlrange="-1 1"/>' for n in "xy")
+    # Without the midphase: its bounding volumes would stay where the obstacles were when the model was compiled, and
+    # the ball would pass through them.
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco>
+        <option timestep="{TIMESTEP}" gravity="0 0 0" iterations="20" integrator="Euler">
+          <flag midphase="disable"/>
+        </option>
+        <default>
+          <joint damping="{DAMPING}"/>
+          <geom friction="{FRICTION} .1 .1" density="1000" margin="0.002" condim="1"/>
+        </default>
+        <worldbody>{geoms}<body name="ball"><geom type="sphere" size="{BALL_RADIUS}"/>{axes}</body></worldbody>
+        <actuator>{motors}</actuator></mujoco>"""
+    )
+
+
+class PointMazeVectorEnv(BatchEnv):
+    """``num_envs`` point mazes, their physics advanced by one call.
+
+    **World.** A room of 15 m x 15 m inside walls of 0.5 m; the picture shows 16 m x 16 m at exactly 4 pixels per
+    metre. Positions are (x, y) in metres from the centre of the room, x to the right and y *down* the picture. Each
+    episode has 20 obstacles of 2 m x 2 m with corners on the pixel grid, uniform over the room outside the 2 m x 2 m
+    square around the goal; they may overlap. The start is uniform over the positions that keep 0.125 m between the
+    ball's centre and everything solid and lie outside the goal. Obstacles and start are drawn again until a corridor
+    0.5 m wide leads from the start to the goal, which is the centre (0, 0).
+
+    **Actions.** 0, 1, 2, 3 push with full force up, down, left, right; with ``continuous`` a force (x, y) in
+    ``Box(-1, 1, (2,), float32)``, x to the right and y down, in units of 100 N per axis.
+
+    **Physics.** MuJoCo on the point body of gymnasium-robotics: a ball of 4.19 kg and 0.1 m radius, joint damping 1,
+    friction 0.5, time step 0.01 s, velocity clipped to 5 m/s per axis before every time step. A step of the
+    environment is 30 time steps. It begins from rest, so that one picture is the whole state, and a push covers about
+    1 m of free floor; ``momentum=True`` keeps the velocity instead.
+
+    **Observation.** uint8 (3, 64, 64), RGB: light floor, dark walls and obstacles, a green square of 1 m at the goal,
+    and the agent as a red disc of 0.3 m radius, antialiased, so that its position can be read to a fraction of a
+    pixel.
+
+    **Reward.** -1 per step and 0 on the step that ends with the ball's centre within 1 m of the goal, which ends
+    the episode; with ``reward_type="sparse"`` 0 and 1. 128 steps under the registered ids.
+
+    **Factors.** ``agent`` (2,), ``velocity`` (2,) with momentum only, ``obstacles`` (20, 2) centres, ``goal`` (2,),
+    all float32, in metres and m/s.
+
+    :param num_envs: number of copies, at least 1
+    :param continuous: two-dimensional forces instead of four pushes
+    :param reward_type: "step" or "sparse"
+    :param momentum: keep the velocity from one step to the next
+    :param n_threads: threads for the physics, at least 1; the results do not depend on it
+    :param max_episode_steps: steps after which an episode is truncated, None for no limit
+    :param render_mode: None or "rgb_array", pictures of 512 x 512
+    :param autoreset: False leaves finished copies for :class:`PointMazeEnv` to reset
+    :raises ValueError: for an unknown ``reward_type`` or ``n_threads`` below 1
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        continuous: bool = False,
+        reward_type: str = "step",
+        momentum: bool = False,
+        n_threads: int = 1,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        autoreset: bool = True,
+    ) -> None:
+        if reward_type not in ("step", "sparse"):
+            raise ValueError(f"reward_type must be 'step' or 'sparse', got {reward_type!r}")
+        if n_threads < 1:
+            raise ValueError(f"n_threads must be at least 1, got {n_threads}")
+        action_space: gym.Space[Any]
+        if continuous:
+            action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        else:
+            action_space = gym.spaces.Discrete(len(DIRECTIONS))
+        pictures = gym.spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
+        super().__init__(num_envs, pictures, action_space, max_episode_steps, render_mode, autoreset)
+        self.continuous = continuous
+        self.reward_type = reward_type
+        self.momentum = momentum
+        self._physics = Batch(point_model(), num_envs, n_threads)
+        self._position = self._physics.bind("qpos")
+        self._velocity = self._physics.bind("qvel")
+        self._force = self._physics.bind("ctrl")
+        self._obstacle_pos = self._physics.expand("geom_pos")[:, _N_WALLS : _N_WALLS + N_OBSTACLES, :2]
+        self._layers = np.zeros((num_envs, *pictures.shape), dtype=np.uint8)
+        self._solid = np.zeros((num_envs, IMAGE_SIZE, IMAGE_SIZE), dtype=bool)
+        self._agent = top_down.DiscPainter(AGENT_RADIUS * PIXELS_PER_METRE, IMAGE_SIZE)
+
+    def _reset_envs(self, indices: NDArray[np.int64]) -> None:
+        self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        for i in indices:
+            corners, occupied, start = draw_layout(self._generators[i])
+            self._obstacle_pos[i] = to_metres(corners + OBSTACLE_PIXELS / 2)
+            self._position[i] = start
+            self._layers[i], self._solid[i] = _static_layer(occupied)
+
+    def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        self._force[:] = actions if self.continuous else DIRECTIONS[actions]
+        clipped = SUBSTEPS
+        if not self.momentum:
+            self._velocity[:] = 0.0
+            self._physics.step(nstep=_UNCLIPPED_SUBSTEPS)
+            clipped -= _UNCLIPPED_SUBSTEPS
+        for _ in range(clipped):
+            np.minimum(self._velocity, _FASTEST, out=self._velocity)
+            np.maximum(self._velocity, -_FASTEST, out=self._velocity)
+            self._physics.step()
+        reached = np.hypot(self._position[:, 0], self._position[:, 1]) <= GOAL_RADIUS
+        rewards = reached - 1.0 if self.reward_type == "step" else reached.astype(np.float64)
+        return rewards, reached
+
+    def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
+        pictures = self._layers[indices]
+        self._agent.draw(pictures, to_pixels(self._position[indices]))
+        return pictures
+
+    def _foreground(self, indices: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """The observations, and which of their pixels show something other than floor.
+
+        :return: pictures (n, 3, 64, 64); masks (n, 64, 64), true where the agent (at any coverage), an obstacle, a
+            wall or the goal is seen. Both are new arrays.
+        """
+        masks = self._solid[indices]
+        self._agent.mark(masks, to_pixels(self._position[indices]))
+        return self._observe(indices), masks
+
+    def _backdrop(self, index: int) -> NDArray[np.uint8]:
+        """The picture of one copy without its agent, shape (3, 64, 64); what ``render`` enlarges."""
+        backdrop: NDArray[np.uint8] = self._layers[index]
+        return backdrop
+
+    def _render_frame(self, index: int) -> NDArray[np.uint8]:
+        return top_down.enlarge(self._backdrop(index), to_pixels(self._position[index]), self._agent.radius)
+
+    def factors(self) -> dict[str, NDArray[Any]]:
+        """The simulator's state behind the current observations, for probes; see the class."""
+        factors = {
+            "agent": self._position.astype(np.float32),
+            "obstacles": self._obstacle_pos.astype(np.float32),
+            "goal": np.zeros((self.num_envs, 2), dtype=np.float32),
+        }
+        if self.momentum:
+            factors["velocity"] = self._velocity.astype(np.float32)
+        return factors
+
+
+class PointMazeEnv(SingleEnv):
+    """One :class:`PointMazeVectorEnv`, as a ``gymnasium.Env``; the specification stands there."""
+
+    batch_class = PointMazeVectorEnv

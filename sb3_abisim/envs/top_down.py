@@ -1,0 +1,161 @@
+"""A small rasteriser for mazes seen from straight above, without GL.
+
+A picture is the static layer of an episode (floor, walls, obstacles, goal; every edge lies on the pixel grid) plus the
+agent, a disc whose pixels are mixed in proportion to the area it covers of them. The mixing is integer arithmetic on
+a table of coverages, so the same state gives the same bytes in a batch and alone.
+
+Pictures are uint8, channels first, RGB. Pixel coordinates are (column, row) as real numbers: (0, 0) is the top left
+corner of the picture and pixel (row r, column c) is the square [c, c + 1) x [r, r + 1).
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+IMAGE_SIZE = 64
+AGENT_RADIUS = 0.3  # m
+# Directions of the discrete actions as seen in the picture, x to the right and y down; in Nav2D's order.
+DIRECTIONS = np.array([(0, -1), (0, 1), (-1, 0), (1, 0)], dtype=np.float64)
+
+FLOOR = (226, 226, 220)
+WALL = (78, 78, 84)
+OBSTACLE = (38, 44, 64)
+GOAL = (40, 170, 70)
+AGENT = (220, 40, 40)
+
+# Positions within a pixel are told apart to 1/128 of it: at most two grey levels between neighbouring ones.
+_SUBPIXEL_BITS = 7
+SUBPIXELS = 1 << _SUBPIXEL_BITS
+_PART_WEIGHTS = np.array((1, SUBPIXELS))
+
+
+def disc_coverage(centre: NDArray[np.float64], radius: float, size: int) -> NDArray[np.float64]:
+    """The exact share of each pixel that a disc covers.
+
+    :param centre: (column, row) of the disc's centre in pixels, shape (..., 2)
+    :param radius: in pixels, above 0
+    :param size: the coverage is computed for the pixels of rows and columns 0 to ``size`` - 1
+    :return: shape (..., size, size), indexed [row, column], 0..1
+    """
+    edges = np.arange(size + 1, dtype=np.float64)
+    x = np.clip(edges - centre[..., 0, None], -radius, radius)[..., None, :]
+    y = np.clip(edges - centre[..., 1, None], -radius, radius)[..., :, None]
+    full = np.pi * radius**2
+    left, above = _area_below(x, radius), _area_below(y, radius)
+    # Area of the part of the disc with abscissa up to x and ordinate up to y.
+    inside = (left + above) / 2 + x * y - full / 4
+    outside = np.where(x < 0, np.where(y < 0, 0.0, left), np.where(y < 0, above, left + above - full))
+    corner = np.where(x**2 + y**2 < radius**2, inside, outside)
+    return np.clip(np.diff(np.diff(corner, axis=-1), axis=-2), 0.0, 1.0)
+
+
+def _area_below(x: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    """Area of the part of a centred disc with abscissa up to ``x``, for x within the radius."""
+    area: NDArray[np.float64] = x * np.sqrt(radius**2 - x**2) + radius**2 * (np.arcsin(x / radius) + np.pi / 2)
+    return area
+
+
+@cache
+def _alpha_table(radius: float) -> NDArray[np.uint8]:
+    """Coverage 0..255 of the patch around a disc for every position of its top left corner within a pixel.
+
+    :return: shape (SUBPIXELS * SUBPIXELS, patch * patch), the first index is row position * SUBPIXELS + column position
+    """
+    patch = _patch_size(radius)
+    offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS + radius
+    rows, columns = np.meshgrid(offsets, offsets, indexing="ij")
+    table = np.rint(disc_coverage(np.stack([columns, rows], axis=-1), radius, patch) * 255).astype(np.uint8)
+    table = table.reshape(SUBPIXELS**2, patch**2)
+    table.flags.writeable = False
+    return table
+
+
+def _patch_size(radius: float) -> int:
+    return int(np.floor(2 * radius)) + 2
+
+
+class DiscPainter:
+    """Draws one antialiased disc into each picture of a batch.
+
+    :param radius: in pixels
+    :param size: height and width of the pictures, in pixels
+    :param colour: RGB, 0..255
+    """
+
+    def __init__(self, radius: float, size: int, colour: tuple[int, int, int] = AGENT) -> None:
+        self.radius = radius
+        self.size = size
+        self._alphas = _alpha_table(radius)
+        patch = _patch_size(radius)
+        self._limit = (size - patch + 1) << _SUBPIXEL_BITS
+        self._weights = np.array((1, size))
+        self._steps = (np.arange(patch)[:, None] * size + np.arange(patch)).reshape(-1)
+        self._channels = np.arange(3)[:, None] * size**2 + self._steps
+        self._colour = np.array(colour, dtype=np.uint32)[:, None]
+
+    def _locate(self, centres: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Flat index of each patch's first pixel, and its coverage, shapes (n,) and (n, patch * patch)."""
+        fine = np.floor((centres - self.radius) * SUBPIXELS).astype(np.int64)
+        # Negative numbers are the largest unsigned ones.
+        if fine.view(np.uint64).max() >= self._limit:
+            raise ValueError(f"a disc of {self.radius} pixels leaves the {self.size} x {self.size} picture: {centres}")
+        whole, part = fine >> _SUBPIXEL_BITS, fine & (SUBPIXELS - 1)
+        return whole @ self._weights, self._alphas[part @ _PART_WEIGHTS]
+
+    def draw(self, pictures: NDArray[np.uint8], centres: NDArray[np.float64]) -> None:
+        """Draw the discs in place.
+
+        :param pictures: contiguous, shape (n, 3, size, size)
+        :param centres: (column, row) in pixels, shape (n, 2)
+        :raises ValueError: where a disc, or the pixel beside it, would lie outside the picture
+        """
+        first, alphas = self._locate(centres)
+        flat = pictures.reshape(-1)
+        starts = first + np.arange(len(pictures)) * (3 * self.size**2)
+        where = starts[:, None, None] + self._channels
+        alpha = alphas[:, None, :].astype(np.uint32)
+        flat[where] = (flat[where] * (255 - alpha) + self._colour * alpha + 127) // 255
+
+    def mark(self, masks: NDArray[np.bool_], centres: NDArray[np.float64]) -> None:
+        """Set the pixels that the discs touch, in place.
+
+        :param masks: contiguous, shape (n, size, size)
+        :param centres: (column, row) in pixels, shape (n, 2)
+        """
+        first, alphas = self._locate(centres)
+        flat = masks.reshape(-1)
+        where = (first + np.arange(len(masks)) * self.size**2)[:, None] + self._steps
+        flat[where] |= alphas > 0
+
+
+def floor(size: int) -> NDArray[np.uint8]:
+    """A picture of nothing but floor, shape (3, size, size)."""
+    return np.tile(np.array(FLOOR, dtype=np.uint8)[:, None, None], (1, size, size))
+
+
+def paint(picture: NDArray[np.uint8], where: NDArray[np.bool_], colour: tuple[int, int, int]) -> None:
+    """Fill the pixels ``where`` (height, width) of one picture (3, height, width) with a colour, in place."""
+    for channel, value in zip(picture, colour, strict=True):
+        channel[where] = value
+
+
+def enlarge(
+    backdrop: NDArray[np.uint8],
+    centre: NDArray[np.float64],
+    radius: float,
+    scale: int = 8,
+    colour: tuple[int, int, int] = AGENT,
+) -> NDArray[np.uint8]:
+    """A picture for people: the backdrop with sharp, larger pixels and the disc drawn at the larger scale.
+
+    :param backdrop: the picture without the agent, shape (3, size, size)
+    :param centre: (column, row) of the disc in pixels of the backdrop
+    :param radius: in pixels of the backdrop
+    :param scale: how many pixels each pixel becomes per side
+    :param colour: of the disc
+    :return: shape (size * scale, size * scale, 3), RGB
+    """
+    large = backdrop.repeat(scale, axis=1).repeat(scale, axis=2).transpose(1, 2, 0)
+    alpha = disc_coverage(np.asarray(centre) * scale, radius * scale, len(large))[..., None]
+    return np.rint(large * (1 - alpha) + np.array(colour) * alpha).astype(np.uint8)

@@ -1,0 +1,300 @@
+"""A user's own videos as backgrounds: decoding once, and a cache shared by processes.
+
+Frames are cropped to the central square and averaged to 64x64. Decoded clips lie in a cache as memory-mapped arrays,
+named by the hash of the original's content, so that a renamed video is found again and a changed one is not mistaken
+for the old.
+
+Decoders go on silently after damage: half a file decodes to half of the frames without an error. What was decoded is
+therefore compared with what the file's header or the numbers of the frames promise.
+"""
+
+import hashlib
+import itertools
+import json
+import os
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.atomic import file_digest, write_atomic
+from sb3_abisim.envs.backgrounds import FRAME_SHAPE, SIZE, Backgrounds, Clip, digest_of
+from sb3_abisim.envs.video_files import Source
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+CACHE_VARIABLE = "SB3_ABISIM_CACHE"
+
+_BYTES_PER_FRAME = 3 * SIZE * SIZE
+# Raise it when the decoding changes, so that older cache entries are not used.
+_CACHE_VERSION = 1
+
+
+class ClipError(ValueError):
+    """One clip cannot be used; ``on_error="skip"`` leaves it out."""
+
+
+def decode_video(path: Path) -> Iterator["Image.Image"]:
+    """The frames of a video file.
+
+    :raises ClipError: if it cannot be decoded or has fewer frames than its header promises
+    :raises ImportError: if the decoder is not installed
+    """
+    av = _import_decoder("av")
+    count = 0
+    try:
+        with av.open(str(path)) as container:
+            promised, share = _promise(container, path)
+            container.streams.video[0].thread_type = "AUTO"
+            for frame in container.decode(video=0):
+                if frame.is_corrupt:
+                    raise ClipError(f"frame {count} of {path} is damaged; replace the file or remove it")
+                yield frame.to_image()
+                count += 1
+    except av.FFmpegError as error:
+        raise ClipError(
+            f"{path} cannot be decoded after {count} frames ({error}); replace the file or remove it"
+        ) from error
+    if promised is not None and count < share * promised:
+        raise ClipError(f"decoded {count} of {promised} frames of {path}: the file is cut off; get a complete copy")
+
+
+def _promise(container: Any, path: Path) -> tuple[int | None, float]:
+    """How many frames the header promises, and the share of them that must come."""
+    if not container.streams.video:
+        raise ClipError(f"{path} holds no video; remove it")
+    stream = container.streams.video[0]
+    if stream.frames:
+        return int(stream.frames), 0.98
+    rate = stream.average_rate
+    if not rate:
+        return None, 0.0
+    if stream.duration is not None:
+        return round(stream.duration * stream.time_base * rate), 0.98
+    if container.duration is not None:
+        # In microseconds, and of the longest stream, which may be the sound.
+        return round(container.duration * rate / 1_000_000), 0.9
+    return None, 0.0
+
+
+def _decode_images(source: Source) -> Iterator["Image.Image"]:
+    image_module = _import_decoder("PIL.Image")
+    _check_numbers(source)
+    for file in source.files:
+        try:
+            with image_module.open(file) as image:
+                yield image.convert("RGB")
+        except (OSError, SyntaxError) as error:
+            raise ClipError(f"{file} cannot be decoded ({error}); replace the file or remove {source.path}") from error
+
+
+def _check_numbers(source: Source) -> None:
+    """Frames numbered 0, 5, 10 are complete, frames 0, 1, 3 are not."""
+    matches = [re.fullmatch("(.*?)([0-9]+)", file.stem) for file in source.files]
+    if len(matches) < 3 or len({match and match[1] for match in matches}) > 1 or matches[0] is None:
+        return
+    numbers = [int(match[2]) for match in matches if match]
+    steps = [b - a for a, b in itertools.pairwise(numbers)]
+    if max(steps) > min(steps) > 0:
+        gap = next(i for i, step in enumerate(steps) if step > min(steps))
+        expected = (numbers[-1] - numbers[0]) // min(steps) + 1
+        raise ClipError(
+            f"{source.path} has {len(numbers)} of {expected} frames: there is none between "
+            f"{source.files[gap].name} and {source.files[gap + 1].name}; restore the missing frames or renumber"
+        )
+
+
+def shrink(image: "Image.Image") -> NDArray[np.uint8]:
+    """The central square of a picture, averaged to uint8 (3, 64, 64)."""
+    box = _import_decoder("PIL.Image").Resampling.BOX
+    side = min(image.size)
+    left, top = (image.width - side) // 2, (image.height - side) // 2
+    small = image.convert("RGB").resize((SIZE, SIZE), box, box=(left, top, left + side, top + side))
+    return np.ascontiguousarray(np.asarray(small).transpose(2, 0, 1))
+
+
+def _import_decoder(module: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(
+            f"your own videos need PyAV and Pillow ({error}): pip install 'sb3_abisim[video]', "
+            "or leave out videos= to use the built-in backgrounds"
+        ) from error
+
+
+# The cache.
+
+
+def cache_folder() -> Path:
+    """Where decoded clips are kept: ``$SB3_ABISIM_CACHE``, else ``sb3_abisim`` in the user's cache folder."""
+    chosen = os.environ.get(CACHE_VARIABLE)
+    if chosen:
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_abisim"
+
+
+def _content_key(source: Source) -> str:
+    digest = hashlib.sha256(f"{_CACHE_VERSION}:{FRAME_SHAPE}:{source.is_video}".encode())
+    for file in source.files:
+        digest.update(file_digest(file).encode())
+    return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A clip's place in the cache: the frames, and a note of their number and sha256 that is written last."""
+
+    source: Source
+    key: str
+
+    @property
+    def frames_path(self) -> Path:
+        return cache_folder() / f"{self.key}.npy"
+
+    @property
+    def note_path(self) -> Path:
+        return cache_folder() / f"{self.key}.json"
+
+    def read(self) -> Clip | None:
+        """The clip, or None where there is no whole, undamaged entry."""
+        try:
+            note = json.loads(self.note_path.read_bytes())
+            frames = _map(self.frames_path)
+            if len(frames) != note["n_frames"] or digest_of(frames) != note["sha256"]:
+                return None
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        load = partial(_map, self.frames_path)
+        return Clip(self.source.name, self.source.group, len(frames), note["sha256"], load)
+
+    def decode(self, max_frames: int) -> None:
+        """Decode the clip into the cache."""
+        source, digest, count = self.source, hashlib.sha256(), 0
+
+        def write(file: BinaryIO) -> None:
+            nonlocal count
+            _write_header(file, 0)
+            for image in decode_video(source.path) if source.is_video else _decode_images(source):
+                if count == max_frames:
+                    raise _too_large(f"{source.path} and the clips before it", f"more than {max_frames}", max_frames)
+                block = shrink(image).tobytes()
+                digest.update(block)
+                file.write(block)
+                count += 1
+            file.seek(0)
+            _write_header(file, count)
+
+        cache_folder().mkdir(parents=True, exist_ok=True)
+        write_atomic(self.frames_path, write)
+        note = {"n_frames": count, "sha256": digest.hexdigest(), "source": str(source.path)}
+        write_atomic(self.note_path, lambda file: file.write(json.dumps(note).encode()))
+
+    def expected_frames(self) -> int:
+        """Number of frames as far as it is known before decoding, else 0."""
+        if not self.source.is_video:
+            return len(self.source.files)
+        av = _import_decoder("av")
+        try:
+            with av.open(str(self.source.path)) as container:
+                return _promise(container, self.source.path)[0] or 0
+        except (ClipError, av.FFmpegError):
+            return 0  # decoding will say what is wrong
+
+
+def _write_header(file: BinaryIO, n_frames: int) -> None:
+    # NumPy pads headers so that the first axis can grow without moving the data.
+    header = {"descr": "|u1", "fortran_order": False, "shape": (n_frames, *FRAME_SHAPE)}
+    np.lib.format.write_array_header_1_0(file, header)
+
+
+def _map(path: Path) -> NDArray[np.uint8]:
+    return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+
+
+def _too_large(what: str, n_frames: object, max_frames: int) -> ValueError:
+    return ValueError(
+        f"{what} have {n_frames} frames, but max_bytes allows {max_frames} ({_BYTES_PER_FRAME} bytes each); "
+        "give fewer or shorter videos, or a larger max_bytes"
+    )
+
+
+@lru_cache(maxsize=16)
+def load_split(
+    origin: str,
+    split: str,
+    train: tuple[Source, ...],
+    unseen: tuple[Source, ...],
+    min_frames: int,
+    max_bytes: int,
+    on_error: str,
+) -> Backgrounds:
+    """Decode one side of the split, or map it from the cache.
+
+    :param origin: the folder, for reports
+    :param split: which side to load
+    :param train: sources of the train side
+    :param unseen: sources of the eval side
+    :raises ClipError: for a clip that cannot be decoded, lacks frames or is shorter than ``min_frames``
+    :raises ValueError: for a file on both sides, more than ``max_bytes`` of frames, or if every clip was skipped
+    """
+    keys = {source: _content_key(source) for source in (*train, *unseen)}
+    by_key = {keys[source]: source for source in train}
+    for source in unseen:
+        twin = by_key.get(keys[source])
+        if twin:
+            raise ValueError(f"{twin.path} (train) and {source.path} (eval) have the same content; remove one of them")
+    entries = [_Entry(source, keys[source]) for source in (train if split == "train" else unseen)]
+    found = {entry: entry.read() for entry in entries}
+    max_frames = max_bytes // _BYTES_PER_FRAME
+    expected = sum(clip.length if clip else entry.expected_frames() for entry, clip in found.items())
+    if expected > max_frames:
+        raise _too_large(f"the {split} clips of {origin}", expected, max_frames)
+    clips: list[Clip] = []
+    skipped: list[tuple[str, str]] = []
+    for entry, cached in _progress(found):
+        try:
+            clips.append(_usable(entry, cached, min_frames, max_frames - sum(clip.length for clip in clips)))
+        except ClipError as error:
+            if on_error == "raise":
+                raise
+            skipped.append((str(entry.source.path), str(error)))
+    if skipped:
+        report = "\n".join(reason for _, reason in skipped)
+        if not clips:
+            raise ValueError(f"all {len(skipped)} {split} clips of {origin} were skipped:\n{report}")
+        warnings.warn(f"skipped {len(skipped)} of {len(entries)} {split} clips:\n{report}", stacklevel=3)
+    return Backgrounds(origin, split, clips, skipped)
+
+
+def _usable(entry: _Entry, clip: Clip | None, min_frames: int, max_frames: int) -> Clip:
+    if clip is None:
+        entry.decode(max_frames)
+        clip = entry.read()
+        if clip is None:
+            raise OSError(f"{entry.frames_path} does not read back as it was written; check the disk")
+    if clip.length < min_frames:
+        raise ClipError(
+            f"{entry.source.path} has {clip.length} frames, fewer than min_frames={min_frames}; "
+            "give a longer clip or a smaller min_frames"
+        )
+    return clip
+
+
+def _progress(found: dict[_Entry, Clip | None]) -> Any:
+    """The entries, with a progress bar while there is something to decode and a terminal to show it on."""
+    items = found.items()
+    if all(found.values()):
+        return items
+    from tqdm import tqdm
+
+    return tqdm(items, desc="decoding backgrounds", unit="clip", disable=None)

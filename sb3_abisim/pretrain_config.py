@@ -1,0 +1,77 @@
+"""What a pretraining run is made of: the settings, read from the YAML files keyed by environment id."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_abisim.resources import resource_path
+
+
+@dataclasses.dataclass(frozen=True)
+class PretrainConfig:
+    """The settings of one pretraining run; the keys of the YAML files are these names.
+
+    :param n_updates: optimiser steps
+    :param batch_size: transitions per update
+    :param learning_rate: of Adam
+    :param k: steps between the two observations of a transition
+    :param holdout: share of the episodes that is only evaluated on, 0 <= holdout < 1
+    :param log_interval: updates between two rows of the log
+    :param checkpoint_interval: updates between two checkpoints
+    :param network: name of the encoder network, None for the default of the observation's shape
+    :param network_kwargs: its constructor arguments
+    :param objective_kwargs: constructor arguments of the objective
+    """
+
+    n_updates: int = 20_000
+    batch_size: int = 256
+    learning_rate: float = 1e-4
+    k: int = 1
+    holdout: float = 0.05
+    log_interval: int = 500
+    checkpoint_interval: int = 1_000
+    network: str | None = None
+    network_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
+    objective_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("n_updates", "batch_size", "k", "log_interval", "checkpoint_interval"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be above 0, got {self.learning_rate!r}")
+        if not 0 <= self.holdout < 1:
+            raise ValueError(f"holdout must lie in [0, 1), got {self.holdout!r}")
+
+    @classmethod
+    def from_mapping(cls, mapping: dict[str, Any]) -> "PretrainConfig":
+        """Build from YAML or keyword settings.
+
+        :raises ValueError: for a key that is no setting
+        """
+        known = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(mapping) - known)
+        if unknown:
+            raise ValueError(f"unknown pretraining setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
+        return cls(**mapping)
+
+
+def load_config(objective: str, env_id: str, overrides: dict[str, Any] | None = None) -> PretrainConfig:
+    """Our settings for an objective and an environment, from ``hyperparams/pretrain/<objective>.yml``.
+
+    :param objective: short name of the objective
+    :param env_id: key in the file; an id that is not there gets the entry ``default``
+    :param overrides: settings that replace those of the file; a dotted name such as ``objective_kwargs.c`` replaces
+        one entry of a nested setting
+    :raises ValueError: for an unknown setting
+    """
+    path = resource_path("hyperparams") / "pretrain" / f"{objective}.yml"
+    entries = yaml.safe_load(Path(path).read_text())
+    mapping = dict(entries.get(env_id, entries["default"]))
+    for name, value in (overrides or {}).items():
+        outer, _, inner = name.partition(".")
+        mapping[outer] = {**mapping.get(outer, {}), inner: value} if inner else value
+    return PretrainConfig.from_mapping(mapping)

@@ -1,0 +1,357 @@
+import json
+import os
+import pickle
+import shutil
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+
+import index_env
+import numpy as np
+import pytest
+
+import sb3_abisim.dataset as dataset_module
+from sb3_abisim import collect as collect_module
+from sb3_abisim.dataset import TransitionDataset
+from sb3_abisim.dataset_format import (
+    CUT,
+    INSIDE,
+    META_NAME,
+    TERMINATED,
+    TRUNCATED,
+    DatasetError,
+    is_shard_file,
+    make_meta,
+    space_from_json,
+    space_to_json,
+)
+from sb3_abisim.dataset_writer import Segment, open_writer
+
+N = 420
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine shards of a few dozen index-valued frames each."""
+    path = tmp_path_factory.mktemp("data") / "index"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(collect_module, "SHARD_TRANSITIONS", 40)
+        collect_module.collect("IndexEnv-v0", N, path, n_envs=4, seed=3)
+    return path
+
+
+@pytest.fixture
+def dataset(folder: Path) -> TransitionDataset:
+    return TransitionDataset(folder)
+
+
+@pytest.fixture
+def copy(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def labels(frames: np.ndarray) -> np.ndarray:
+    """(step, episode, action before) of each frame, which must be the same at every pixel."""
+    assert frames.shape[1:] == index_env.SHAPE
+    assert (frames == frames[:, :, :1, :1]).all()
+    return frames[:, :, 0, 0].astype(np.int64)
+
+
+def test_counts_and_description(dataset: TransitionDataset) -> None:
+    assert dataset.n_transitions == N == len(dataset.valid_starts())
+    assert len(dataset.meta["shards"]) == 9
+    assert dataset.n_frames == N + np.count_nonzero(dataset.ends)
+    assert dataset.env_id == "IndexEnv-v0"
+    assert dataset.env_kwargs == {}
+    assert dataset.observation_space == index_env.IndexVectorEnv(1).single_observation_space
+    assert dataset.action_space == index_env.IndexVectorEnv(1).single_action_space
+    assert set(np.unique(dataset.ends)) == {INSIDE, TERMINATED, TRUNCATED, CUT}
+
+
+def test_frames_of_a_segment_are_one_episode_with_its_actions_and_factors(dataset: TransitionDataset) -> None:
+    everything = np.arange(dataset.n_frames)
+    seen, actions, factors = (
+        labels(dataset.frames(everything)),
+        dataset.actions(everything),
+        dataset.factors(everything),
+    )
+    begins_episode = True
+    for t in everything:
+        step, episode, action_before = seen[t]
+        assert factors["step"][t] == step
+        assert tuple(factors["pair"][t]) == (step, episode)
+        assert factors["even"][t] == (step % 2 == 0)
+        if begins_episode:
+            assert (step, action_before) == (0, index_env.NO_ACTION)
+        end = dataset.ends[t]
+        if end == INSIDE:
+            assert tuple(seen[t + 1]) == (step + 1, episode, actions[t])
+        else:
+            assert actions[t] == 0
+            assert step <= index_env.LIMIT
+            if end == TRUNCATED:
+                assert step == index_env.LIMIT
+        begins_episode = end != INSIDE
+    assert factors["even"].dtype == bool
+    assert factors["step"].dtype == np.int32
+
+
+@pytest.mark.parametrize("k", [1, 2, 5, 6])
+def test_valid_starts_are_those_found_by_walking(dataset: TransitionDataset, k: int) -> None:
+    ends = dataset.ends
+    expected = [t for t in range(dataset.n_frames - k) if not ends[t : t + k].any()]
+    assert dataset.valid_starts(k).tolist() == expected
+    assert len(expected) > 0
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_pairs_never_cross_an_episode(dataset: TransitionDataset, k: int) -> None:
+    pairs = 0
+    for batch in dataset.batches(7, k=k):
+        now, later = labels(batch.observations), labels(batch.next_observations)
+        assert (later[:, 0] == now[:, 0] + k).all()
+        assert (later[:, 1] == now[:, 1]).all()
+        if k == 1:
+            assert (later[:, 2] == batch.actions).all()
+        assert batch.actions.dtype == np.int64
+        assert batch.observations.dtype == np.uint8
+        pairs += len(batch.actions)
+    assert pairs == len(dataset.valid_starts(k)) // 7 * 7
+
+
+def test_too_large_k_names_the_longest_segment(dataset: TransitionDataset) -> None:
+    with pytest.raises(ValueError, match=rf"k = {index_env.LIMIT + 1} .* longest has {index_env.LIMIT}"):
+        dataset.valid_starts(index_env.LIMIT + 1)
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        dataset.batches(4, k=0)
+
+
+def as_rows(batches: Iterator[dataset_module.TransitionBatch]) -> np.ndarray:
+    rows = [np.concatenate([b.observations, b.next_observations]).tobytes() + b.actions.tobytes() for b in batches]
+    return np.array(rows, dtype=object)
+
+
+def test_order_follows_from_seed_and_epoch_and_start_skips_batches(dataset: TransitionDataset) -> None:
+    whole = as_rows(dataset.batches(16, seed=5, epoch=2))
+    assert len(whole) == N // 16
+    assert (as_rows(dataset.batches(16, seed=5, epoch=2)) == whole).all()
+    assert (as_rows(dataset.batches(16, seed=5, epoch=2, start=10)) == whole[10:]).all()
+    assert len(as_rows(dataset.batches(16, start=len(whole)))) == 0
+    for other in (dataset.batches(16, seed=5, epoch=3), dataset.batches(16, seed=6, epoch=2)):
+        assert (as_rows(other) != whole).all()
+
+
+def test_a_pass_visits_every_transition_once(dataset: TransitionDataset) -> None:
+    # The label of s_{t+1} and its first factor do not name a transition; the order of frames does.
+    starts = dataset.valid_starts(2)
+    visited = [label for b in dataset.batches(1, k=2) for label in map(tuple, labels(b.observations))]
+    assert sorted(visited) == sorted(map(tuple, labels(dataset.frames(starts))))
+
+
+def test_batch_larger_than_the_data_is_refused(dataset: TransitionDataset) -> None:
+    with pytest.raises(ValueError, match=f"batch_size 421 exceeds the {N} transitions"):
+        dataset.batches(N + 1)
+
+
+def test_gather_keeps_the_asked_order_across_shards(dataset: TransitionDataset) -> None:
+    everything = dataset.frames(np.arange(dataset.n_frames))
+    index = np.random.default_rng(0).integers(dataset.n_frames, size=300)
+    assert (dataset.frames(index) == everything[index]).all()
+    assert dataset.frames(np.array([], dtype=np.int64)).shape == (0, *index_env.SHAPE)
+
+
+@pytest.mark.parametrize("index", [[-1], [10**6], [0.5], 3])
+def test_bad_indices_are_refused(dataset: TransitionDataset, index: object) -> None:
+    with pytest.raises(IndexError):
+        dataset.frames(index)
+    with pytest.raises(IndexError):
+        dataset.actions(index)
+
+
+def test_parts_share_no_segment(folder: Path) -> None:
+    dataset = TransitionDataset(folder, holdout=0.2)
+    segment = np.cumsum(np.concatenate([[0], dataset.ends[:-1] != INSIDE]))
+    train, test = dataset.valid_starts(part="train"), dataset.valid_starts(part="test")
+    assert not set(segment[train]) & set(segment[test])
+    assert sorted([*train, *test]) == dataset.valid_starts().tolist()
+    assert len(set(segment[test])) == round(0.2 * (segment[-1] + 1))
+    assert dataset.valid_starts(part="test").tolist() == test.tolist()
+    with pytest.raises(ValueError, match="part must be"):
+        dataset.valid_starts(part="valid")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="holdout 0"):
+        TransitionDataset(folder, holdout=0).valid_starts(part="test")
+
+
+def test_pickle_holds_no_data(dataset: TransitionDataset) -> None:
+    sent = pickle.dumps(dataset)
+    assert len(sent) < 1000
+    again = pickle.loads(sent)
+    assert (again.frames(np.arange(50)) == dataset.frames(np.arange(50))).all()
+
+
+def test_every_flipped_bit_is_detected(copy: Path) -> None:
+    rng = np.random.default_rng(1)
+    meta = json.loads((copy / META_NAME).read_bytes())
+    names = [n for n in os.listdir(copy) if n.endswith(".npy") or n == META_NAME]
+    detected = 0
+    for name in [*rng.choice(names, size=150), *[META_NAME] * 50]:
+        path = copy / name
+        original = path.read_bytes()
+        damaged = bytearray(original)
+        damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
+        path.write_bytes(damaged)
+        try:
+            # A flip that turns one white space of the document into another means nothing.
+            assert TransitionDataset(copy).meta == meta
+            assert name == META_NAME
+        except DatasetError as error:
+            assert name in str(error)
+            detected += 1
+        path.write_bytes(original)
+    assert detected >= 190
+    TransitionDataset(copy)
+
+
+def test_truncated_and_missing_files_are_named(copy: Path) -> None:
+    path = copy / "actions-00001.npy"
+    content = path.read_bytes()
+    path.write_bytes(content[:-1])
+    with pytest.raises(
+        DatasetError, match=rf"actions-00001.npy has {len(content) - 1} bytes.*sb3_abisim.collect --env"
+    ):
+        TransitionDataset(copy, verify=False)
+    path.unlink()
+    with pytest.raises(DatasetError, match=r"actions-00001\.npy is missing"):
+        TransitionDataset(copy, verify=False)
+
+
+def test_large_datasets_are_hashed_on_request_only(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dataset_module, "VERIFY_BELOW_BYTES", 1000)
+    path = copy / "frames-00002.npy"
+    damaged = bytearray(path.read_bytes())
+    damaged[-1] ^= 1
+    path.write_bytes(damaged)
+    TransitionDataset(copy)
+    with pytest.raises(DatasetError, match=r"frames-00002\.npy is damaged"):
+        TransitionDataset(copy, verify=True)
+
+
+def test_a_process_hashes_a_file_once_unless_it_changed(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed = []
+    real = dataset_module.file_digest
+    monkeypatch.setattr(dataset_module, "file_digest", lambda path: hashed.append(path) or real(path))
+    TransitionDataset(copy)
+    assert len(hashed) == 9 * 6
+    TransitionDataset(copy)
+    assert len(hashed) == 9 * 6
+    os.utime(copy / "ends-00000.npy", ns=(0, 0))
+    TransitionDataset(copy)
+    assert hashed[9 * 6 :] == [copy / "ends-00000.npy"]
+
+
+def test_reading_does_not_load_the_pictures(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    length, n_segments, shape = 100, 40, (3, 64, 64)
+    identity = {
+        "format_version": 1,
+        "env_id": "Large-v0",
+        "env_kwargs": {},
+        "observation_space": {"type": "Box", "low": 0, "high": 255, "shape": shape, "dtype": "uint8"},
+        "action_space": {"type": "Discrete", "n": 4, "start": 0},
+        "factors": {},
+        **dict.fromkeys(["fingerprint", "policy", "seed", "n_envs", "steps_per_shard", "source"]),
+    }
+    frames = rng.integers(256, size=(length + 1, *shape), dtype=np.uint8)
+    with open_writer(tmp_path / "large", identity) as writer:
+        for k in range(4):
+            writer.write_shard(k, [Segment(frames, np.ones(length, np.int64), CUT)] * (n_segments // 4))
+        writer.finish(4)
+    tracemalloc.start()
+    try:
+        dataset = TransitionDataset(tmp_path / "large")
+        for batch, _ in zip(dataset.batches(32), range(5), strict=False):
+            index = batch.observations
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert index.shape == (32, *shape)
+    size = n_segments * (length + 1) * frames[0].size
+    assert peak < size / 10
+
+
+def test_a_pickle_in_place_of_an_array_is_not_run(copy: Path, tmp_path: Path) -> None:
+    class Payload:
+        def __reduce__(self) -> tuple[object, ...]:
+            return Path.touch, (tmp_path / "executed",)
+
+    meta = json.loads((copy / META_NAME).read_bytes())
+    np.save(copy / "actions-00000.npy", np.array([Payload()], dtype=object), allow_pickle=True)
+    rewrite_meta(copy, meta)
+    with pytest.raises(DatasetError, match=r"actions-00000\.npy is not an array file of ours"):
+        TransitionDataset(copy)
+    assert not (tmp_path / "executed").exists()
+
+
+def test_a_forged_manifest_does_not_lead_out_of_the_folder(copy: Path) -> None:
+    meta = json.loads((copy / META_NAME).read_bytes())
+    meta["factors"]["../../secret"] = {"dtype": "<f4", "shape": []}
+    rewrite_meta(copy, meta)
+    with pytest.raises(DatasetError, match="factor names"):
+        TransitionDataset(copy)
+
+
+def rewrite_meta(folder: Path, meta: dict) -> None:
+    """Make a forger's meta.json: all sums are right."""
+    for shard in meta["shards"]:
+        for name, entry in shard["files"].items():
+            entry |= {"bytes": (folder / name).stat().st_size, "sha256": dataset_module.file_digest(folder / name)}
+    config = {k: v for k, v in meta.items() if k not in ("n_transitions", "n_frames", "shards", "digest", "checksum")}
+    (folder / META_NAME).write_text(json.dumps(make_meta(config, meta["shards"])))
+
+
+def test_what_is_not_a_finished_dataset_is_refused_with_the_remedy(copy: Path, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"nothing is not a folder.*sb3_abisim\.collect"):
+        TransitionDataset(tmp_path / "nothing")
+    (tmp_path / "other").mkdir()
+    with pytest.raises(DatasetError, match="other is not a dataset"):
+        TransitionDataset(tmp_path / "other")
+    meta = json.loads((copy / META_NAME).read_bytes())
+    (copy / META_NAME).write_text(json.dumps(meta | {"format_version": 2}))
+    with pytest.raises(DatasetError, match="format version 2, this version reads 1"):
+        TransitionDataset(copy)
+    (copy / META_NAME).unlink()
+    with pytest.raises(DatasetError, match="unfinished"):
+        TransitionDataset(copy)
+
+
+def test_digest_depends_on_data_and_arguments_but_not_on_versions(copy: Path) -> None:
+    meta = json.loads((copy / META_NAME).read_bytes())
+    config = {k: v for k, v in meta.items() if k not in ("n_transitions", "n_frames", "shards", "digest", "checksum")}
+    shards = meta["shards"]
+    assert make_meta(config, shards)["digest"] == meta["digest"]
+    assert make_meta(config | {"versions": {"numpy": "0"}}, shards)["digest"] == meta["digest"]
+    assert make_meta(config | {"seed": 4}, shards)["digest"] != meta["digest"]
+    assert make_meta(config, shards[::-1])["digest"] != meta["digest"]
+
+
+def test_spaces_survive_json() -> None:
+    import gymnasium as gym
+
+    for space in (
+        gym.spaces.Discrete(4, start=-2),
+        gym.spaces.Box(0, 255, (3, 15, 15), np.uint8),
+        gym.spaces.Box(np.float32([-0.1, -2]), np.float32([1e-7, 3])),
+    ):
+        document = json.loads(json.dumps(space_to_json(space)))
+        again = space_from_json(document)
+        assert again == space
+        assert again.dtype == space.dtype
+        assert space_to_json(again) == document
+    with pytest.raises(ValueError, match="MultiBinary"):
+        space_to_json(gym.spaces.MultiBinary(3))
+
+
+def test_only_our_own_files_are_ever_cleaned_up() -> None:
+    ours = ["frames-00000.npy", "factor_agent-00012.npy", "shard-00003.json", "ends-123456.npy"]
+    others = ["frames.npy", "notes-00000.npy", "meta.json", "factor_-00001.npy", "shard-00003.json.bak"]
+    assert [is_shard_file(name) for name in ours + others] == [True] * len(ours) + [False] * len(others)

@@ -1,0 +1,365 @@
+"""PointMaze: physics against gymnasium-robotics' point body, layouts against a plain flood fill, pictures."""
+
+import importlib.util
+from pathlib import Path
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+from stable_baselines3.common.env_checker import check_env
+
+import sb3_abisim  # noqa: F401
+from sb3_abisim.envs import point_maze, top_down
+from sb3_abisim.envs.point_maze import PointMazeEnv, PointMazeVectorEnv, point_model
+
+UP, DOWN, LEFT, RIGHT = range(4)
+FAR = 100.0  # where an obstacle is out of the way
+
+
+def place(env: PointMazeVectorEnv, agent: tuple[float, float], obstacles: tuple[tuple[float, float], ...] = ()) -> None:
+    """Put the ball and the obstacles of every copy where a test wants them."""
+    env._obstacle_pos[:] = FAR
+    for slot, centre in enumerate(obstacles):
+        env._obstacle_pos[:, slot] = centre
+    env._position[:] = agent
+    env._velocity[:] = 0.0
+
+
+def batch(n: int = 1, **kwargs: object) -> PointMazeVectorEnv:
+    env = PointMazeVectorEnv(num_envs=n, **kwargs)  # type: ignore[arg-type]
+    env.reset(seed=0)
+    return env
+
+
+def random_actions(env: PointMazeVectorEnv, generator: np.random.Generator) -> np.ndarray:
+    if env.continuous:
+        return generator.choice([-1.0, 1.0, 1.0, 0.3], size=(env.num_envs, 2)).astype(np.float32)
+    return generator.integers(4, size=env.num_envs)
+
+
+# The physics.
+
+
+@pytest.fixture(scope="module")
+def point_xml() -> Path:
+    """gymnasium-robotics' point body; the package is found, not imported."""
+    spec = importlib.util.find_spec("gymnasium_robotics")
+    if spec is None or spec.origin is None:
+        pytest.skip("gymnasium-robotics is not installed")
+    return Path(spec.origin).parent / "envs/assets/point/point.xml"
+
+
+def test_the_model_has_the_numbers_of_gymnasium_robotics(point_xml: Path) -> None:
+    ours, theirs = point_model(), mujoco.MjModel.from_xml_path(str(point_xml))
+    our_ball, their_ball = ours.ngeom - 1, theirs.geom("particle_geom").id
+    np.testing.assert_array_equal(ours.dof_damping, theirs.dof_damping)
+    np.testing.assert_array_equal(ours.body_mass[1], theirs.body_mass[1])
+    np.testing.assert_array_equal(ours.actuator_gear, theirs.actuator_gear)
+    np.testing.assert_array_equal(ours.actuator_ctrlrange, theirs.actuator_ctrlrange)
+    for name in ("geom_size", "geom_friction", "geom_margin", "geom_condim", "geom_solref", "geom_solimp"):
+        np.testing.assert_array_equal(getattr(ours, name)[our_ball], getattr(theirs, name)[their_ball], err_msg=name)
+    for name in ("timestep", "integrator", "iterations", "solver", "tolerance", "cone", "impratio", "gravity"):
+        np.testing.assert_array_equal(getattr(ours.opt, name), getattr(theirs.opt, name), err_msg=name)
+
+
+@pytest.mark.parametrize("momentum", [False, True])
+def test_free_motion_equals_point_envs_loop(point_xml: Path, momentum: bool) -> None:
+    """One decision is 30 times PointEnv.step: clip the velocity, then one MuJoCo step."""
+    model = mujoco.MjModel.from_xml_path(str(point_xml))
+    data = mujoco.MjData(model)
+    env = batch(continuous=True, momentum=momentum)
+    place(env, (-3.0, 2.0))
+    data.qpos[:] = (-3.0, 2.0)
+    for action in ((1.0, -0.5), (1.0, -1.0), (-0.25, 0.125), (1.0, 1.0)):
+        env._advance(np.array([action], dtype=np.float32))
+        if not momentum:
+            data.qvel[:] = 0
+        data.ctrl[:] = action
+        for _ in range(30):
+            data.qvel[:] = np.clip(data.qvel, -5, 5)
+            mujoco.mj_step(model, data)
+        np.testing.assert_allclose(env._position[0], data.qpos, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(env._velocity[0], data.qvel, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_leaving_out_the_first_clips_changes_no_bit(seed: int) -> None:
+    env, plain = batch(32, continuous=True), batch(32, continuous=True)
+    generator = np.random.default_rng(seed)
+    for _ in range(60):
+        actions = random_actions(env, generator)
+        env._advance(actions)
+        plain._force[:], plain._velocity[:] = actions, 0.0
+        for _ in range(point_maze.SUBSTEPS):
+            plain._velocity[:] = np.clip(plain._velocity, -point_maze.MAX_VELOCITY, point_maze.MAX_VELOCITY)
+            plain._physics.step()
+        np.testing.assert_array_equal(env._position, plain._position)
+        np.testing.assert_array_equal(env._velocity, plain._velocity)
+
+
+@pytest.mark.parametrize(("action", "direction"), [(UP, (0, -1)), (DOWN, (0, 1)), (LEFT, (-1, 0)), (RIGHT, (1, 0))])
+def test_a_push_covers_one_metre_in_its_direction(action: int, direction: tuple[int, int]) -> None:
+    env = batch()
+    place(env, (-3.0, 4.0))
+    env.step(np.array([action]))
+    moved = env._position[0] - (-3.0, 4.0)
+    np.testing.assert_allclose(moved, direction, atol=0.1)
+    assert env._velocity[0] @ np.array(direction) > 4  # which the next step must not inherit
+    env.step(np.array([action]))
+    np.testing.assert_allclose(env._position[0] - (-3.0, 4.0) - moved, moved, atol=1e-9)
+
+
+def test_momentum_carries_the_ball_on() -> None:
+    env = batch(continuous=True, momentum=True)
+    place(env, (-6.0, 4.0))
+    env.step(np.array([(1.0, 0.0)], dtype=np.float32))
+    before = env._position[0].copy()
+    env.step(np.zeros((1, 2), dtype=np.float32))
+    assert 1.2 < env._position[0, 0] - before[0] < 1.6
+    np.testing.assert_array_equal(env.factors()["velocity"], env._velocity.astype(np.float32))
+
+
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize(
+    ("action", "axis", "side"),
+    [(UP, 1, 1), (DOWN, 1, -1), (LEFT, 0, 1), (RIGHT, 0, -1)],
+    ids=["up", "down", "left", "right"],
+)
+@pytest.mark.parametrize("centre", [(3.0, -4.0), (1.25, 2.5), (-4.5, 0.25)])
+def test_an_obstacle_stops_the_ball(n: int, action: int, axis: int, side: int, centre: tuple[float, float]) -> None:
+    """MuJoCo passes through static geoms that were moved, without a word, unless the model is built for it."""
+    env = batch(n)
+    start = np.array(centre)
+    start[axis] += side * 1.7
+    place(env, tuple(start), (centre,))
+    for _ in range(4):
+        env._advance(np.full(n, action))
+    gap = (env._position[:, axis] - centre[axis]) * side - 1.0
+    np.testing.assert_allclose(gap, point_maze.BALL_RADIUS, atol=0.02)
+    np.testing.assert_allclose(env._position[:, 1 - axis], centre[1 - axis], atol=1e-3)
+
+
+def test_nothing_is_left_where_the_obstacles_were() -> None:
+    env = batch(2)
+    place(env, (-1.9, 3.0), ((0.0, 3.0),))
+    env._advance(np.full(2, RIGHT))
+    env._obstacle_pos[1, 0] = FAR
+    for _ in range(4):
+        env._advance(np.full(2, RIGHT))
+    assert env._position[0, 0] < -1.0
+    assert env._position[1, 0] > 1.5
+
+
+@pytest.mark.parametrize(("action", "axis", "sign"), [(UP, 1, -1), (DOWN, 1, 1), (LEFT, 0, -1), (RIGHT, 0, 1)])
+def test_walls_hold_the_ball(action: int, axis: int, sign: int) -> None:
+    env = batch()
+    place(env, (2.0, 3.0))
+    for _ in range(12):
+        env._advance(np.array([action]))
+    np.testing.assert_allclose(env._position[0, axis] * sign, 7.5 - point_maze.BALL_RADIUS, atol=0.02)
+
+
+def test_random_play_never_enters_an_obstacle() -> None:
+    env = batch(32, max_episode_steps=50)
+    generator = np.random.default_rng(3)
+    for _ in range(150):
+        env.step(random_actions(env, generator))
+        inside = np.abs(env._position[:, None] - env._obstacle_pos).max(axis=-1) < 1.0
+        assert not inside.any()
+        assert np.abs(env._position).max() < 7.5
+
+
+# Layouts.
+
+
+def solid_pixels(obstacles: np.ndarray) -> np.ndarray:
+    """Walls and obstacles on the 64 x 64 grid, [row, column], from the centres in metres."""
+    solid = np.ones((64, 64), dtype=bool)
+    solid[2:62, 2:62] = False
+    for x, y in obstacles:
+        column, row = (x - 1 + 8) * 4, (y - 1 + 8) * 4
+        assert column == int(column) and row == int(row)
+        assert 2 <= column <= 54 and 2 <= row <= 54
+        solid[int(row) : int(row) + 8, int(column) : int(column) + 8] = True
+    return solid
+
+
+def reachable(solid: np.ndarray) -> np.ndarray:
+    """Top left pixels of the 0.5 m squares that slide to the goal over free floor, by depth-first search."""
+    free = ~(solid[:-1, :-1] | solid[1:, :-1] | solid[:-1, 1:] | solid[1:, 1:])
+    seen = np.zeros_like(free)
+    stack = [(31, 31)]
+    while stack:
+        row, column = stack.pop()
+        if free[row, column] and not seen[row, column]:
+            seen[row, column] = True
+            stack += [(row + 1, column), (row - 1, column), (row, column + 1), (row, column - 1)]
+    return seen
+
+
+def test_every_layout_keeps_its_promises() -> None:
+    env = batch(60)
+    factors = env.factors()
+    covered = np.zeros((64, 64), dtype=int)
+    for obstacles, (x, y) in zip(factors["obstacles"], factors["agent"], strict=True):
+        assert obstacles.shape == (20, 2)
+        solid = solid_pixels(obstacles)
+        covered += solid
+        assert not solid[28:36, 28:36].any(), "an obstacle within the square around the goal"
+        assert np.hypot(x, y) > 1.0
+        column, row = (x + 8) * 4, (y + 8) * 4
+        rows, columns = np.nonzero(solid)
+        gap = np.hypot(
+            np.maximum(np.abs(columns + 0.5 - column) - 0.5, 0), np.maximum(np.abs(rows + 0.5 - row) - 0.5, 0)
+        ).min()
+        assert gap >= 0.5 - 1e-4, "0.125 m between the ball's centre and everything solid"
+        assert reachable(solid)[round(row) - 1, round(column) - 1]
+    assert (covered[2:62, 2:62] > 0).sum() > 0.98 * (60 * 60 - 8 * 8)
+
+
+def test_blocked_layouts_are_rejected_by_the_flood_fill() -> None:
+    """A ring of obstacles around the goal, with a gap of two pixels or of one."""
+    for gap, expected in ((2, True), (1, False)):
+        board = point_maze._WALLS
+        ring = np.zeros((64, 64), dtype=bool)
+        ring[20:44, 20:44], ring[24:40, 24:40] = True, False
+        ring[20:24, 30 : 30 + gap] = False
+        board |= int.from_bytes(np.packbits(ring, bitorder="little").tobytes(), "little")
+        free = point_maze._FULL & ~board
+        blocks = free & free >> 1 & free >> 64 & free >> 65
+        start = 1 << (5 * 64 + 5)
+        assert point_maze._connected(blocks, start, point_maze._GOAL_BLOCK) is expected
+        assert reachable(ring | solid_pixels(np.zeros((0, 2))))[5, 5] == expected
+
+
+# Determinism.
+
+
+@pytest.mark.parametrize("kwargs", [{}, {"continuous": True}, {"momentum": True}, {"n_threads": 2}])
+def test_a_batch_equals_single_environments_bit_for_bit(kwargs: dict[str, object]) -> None:
+    n = 4
+    together = PointMazeVectorEnv(num_envs=n, autoreset=False, **kwargs)  # type: ignore[arg-type]
+    alone = [PointMazeEnv(**kwargs) for _ in range(n)]
+    generator = np.random.default_rng(5)
+    pictures, _ = together.reset(seed=10)
+    for i, env in enumerate(alone):
+        np.testing.assert_array_equal(env.reset(seed=10 + i)[0], pictures[i])
+    for _ in range(25):
+        actions = random_actions(together, generator)
+        if together._finished.any():
+            break
+        pictures, rewards, reached, _, _ = together.step(actions)
+        for i, env in enumerate(alone):
+            picture, reward, terminated, _, _ = env.step(actions[i])
+            np.testing.assert_array_equal(picture, pictures[i])
+            assert (reward, terminated) == (rewards[i], reached[i])
+            for name, value in env.factors().items():
+                np.testing.assert_array_equal(value, together.factors()[name][i])
+
+
+def test_reset_with_a_seed_determines_everything() -> None:
+    def play(seed: int) -> list[bytes]:
+        env = PointMazeVectorEnv(num_envs=3, max_episode_steps=5)
+        env.reset(seed=99)
+        frames = [env.reset(seed=seed)[0]]
+        generator = np.random.default_rng(0)
+        frames += [env.step(random_actions(env, generator))[0] for _ in range(12)]
+        return [frame.tobytes() for frame in frames]
+
+    assert play(1) == play(1)
+    assert play(1)[0] != play(2)[0]
+
+
+# Rewards, episode ends and pictures.
+
+
+@pytest.mark.parametrize(("reward_type", "expected"), [("step", [-1.0, 0.0]), ("sparse", [0.0, 1.0])])
+def test_the_goal_ends_the_episode(reward_type: str, expected: list[float]) -> None:
+    env = batch(reward_type=reward_type, autoreset=False)
+    place(env, (2.9, 0.1))
+    _, rewards, terminated, truncated, infos = env.step(np.array([LEFT]))
+    assert (rewards[0], terminated[0], infos["is_success"][0]) == (expected[0], False, False)
+    _, rewards, terminated, truncated, infos = env.step(np.array([LEFT]))
+    assert (rewards[0], terminated[0], truncated[0], infos["is_success"][0]) == (expected[1], True, False, True)
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(np.array([LEFT]))
+
+
+def test_the_picture_shows_what_the_factors_say() -> None:
+    env = batch(20)
+    pictures = env._observe(np.arange(20))
+    factors = env.factors()
+    for picture, (x, y), obstacles in zip(pictures, factors["agent"], factors["obstacles"], strict=True):
+        solid = solid_pixels(obstacles)
+        walls = solid_pixels(np.zeros((0, 2)))
+        expected = np.empty((64, 64, 3), dtype=np.uint8)
+        expected[:] = top_down.FLOOR
+        expected[30:34, 30:34] = top_down.GOAL
+        expected[solid] = top_down.OBSTACLE
+        expected[walls] = top_down.WALL
+        column, row = (x + 8) * 4, (y + 8) * 4
+        distance = np.hypot(np.arange(64) + 0.5 - column, (np.arange(64) + 0.5 - row)[:, None])
+        away = distance > 1.2 + 0.75
+        np.testing.assert_array_equal(picture.transpose(1, 2, 0)[away], expected[away])
+        assert (picture[:, int(row), int(column)] == top_down.AGENT).sum() >= 2 or distance.min() > 0.4
+
+
+def test_foreground_is_everything_but_floor() -> None:
+    env = batch(12)
+    indices = np.array([1, 4, 11])
+    pictures, masks = env._foreground(indices)
+    np.testing.assert_array_equal(pictures, env._observe(indices))
+    floor = (pictures == np.array(top_down.FLOOR, dtype=np.uint8)[:, None, None]).all(axis=1)
+    # A pixel of which the agent covers less than half a percent may keep the colour of the floor.
+    assert (masks & floor).sum() <= 2
+    assert not (~masks & ~floor).any()
+    pictures[:], masks[:] = 0, False
+    assert env._foreground(indices)[1].any() and env._observe(indices).any()
+
+
+def test_render_shows_the_same_scene_enlarged() -> None:
+    env = gym.make("PointMaze-v0", render_mode="rgb_array")
+    picture, _ = env.reset(seed=1)
+    frame = env.render()
+    assert frame.shape == (512, 512, 3) and frame.dtype == np.uint8
+    shrunk = frame.reshape(64, 8, 64, 8, 3).mean(axis=(1, 3)).transpose(2, 0, 1)
+    assert np.abs(shrunk - picture).max() <= 3
+    env.close()
+
+
+# The interface.
+
+
+@pytest.mark.parametrize("env_id", ["PointMaze-v0", "ContinuousPointMaze-v0"])
+def test_registered_ids_pass_the_checkers(env_id: str) -> None:
+    check_env(gym.make(env_id).unwrapped, skip_render_check=False)
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    done, steps = False, 0
+    while not done:
+        action = np.array([0.0, 0.0], dtype=np.float32) if "Continuous" in env_id else 0
+        _, reward, terminated, truncated, info = env.step(action)
+        done, steps = terminated or truncated, steps + 1
+        assert reward == -1.0 or terminated
+        assert info["is_success"] == terminated
+    assert terminated or steps == 128
+    vector = gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point")
+    assert isinstance(vector, PointMazeVectorEnv) and vector.max_episode_steps == 128
+
+
+@pytest.mark.parametrize(
+    ("continuous", "action"),
+    [(False, 4), (False, -1), (False, 1.0), (False, [0]), (True, [1.5, 0]), (True, [np.nan, 0]), (True, [0.0])],
+)
+def test_bad_actions_are_refused(continuous: bool, action: object) -> None:
+    env = PointMazeEnv(continuous=continuous)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+
+
+@pytest.mark.parametrize(("kwargs", "message"), [({"reward_type": "dense"}, "dense"), ({"n_threads": 0}, "n_threads")])
+def test_bad_arguments_are_refused(kwargs: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PointMazeEnv(**kwargs)

@@ -1,0 +1,345 @@
+"""A user's own videos: finding, splitting, decoding, cache, and every mistake with its remedy."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from sb3_abisim.envs import video
+from sb3_abisim.envs.backgrounds import load_backgrounds
+from sb3_abisim.envs.distractors import DistractorPointMazeVectorEnv
+from sb3_abisim.envs.video_files import find_sources, natural_key, split_sources
+
+av = pytest.importorskip("av")
+Image = pytest.importorskip("PIL.Image")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("SB3_ABISIM_CACHE", str(folder))
+    return folder
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "videos").mkdir()
+    return tmp_path / "videos"
+
+
+def shade(seed, frame):
+    return (40 * seed + 2 * frame) % 250
+
+
+def write_video(path, seed=0, n_frames=64, size=(96, 72), codec="mpeg4"):
+    """A video whose frames brighten one by one; black outside of the central square."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25)
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p"
+        stream.bit_rate = 4_000_000
+        margin = (size[0] - size[1]) // 2
+        for i in range(n_frames):
+            pixels = np.zeros((size[1], size[0], 3), dtype=np.uint8)
+            pixels[:, margin : size[0] - margin] = shade(seed, i)
+            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+    return path
+
+
+def write_frames(folder, seed=0, numbers=range(20), pattern="frame{}.png", size=(80, 60)):
+    """Frame n is filled with its number (red) and the seed (green)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in numbers:
+        Image.new("RGB", size, (number, seed, 7)).save(folder / pattern.format(number))
+    return folder
+
+
+def two_folders(folder):
+    return write_frames(folder / "a", 1), write_frames(folder / "b", 2)
+
+
+def both(folder, **kwargs):
+    return [load_backgrounds(folder, split, **kwargs) for split in ("train", "eval")]
+
+
+def shown(clips, index=0):
+    return clips.frames(np.full(clips.lengths[index], index), np.arange(clips.lengths[index]))
+
+
+class TestDecoding:
+    def test_video_frames_in_order_and_cropped_to_the_centre(self, folder):
+        for seed in range(3):
+            write_video(folder / f"film{seed}.mp4", seed)
+        for clips in both(folder):
+            for index, name in enumerate(clips.names):
+                frames = shown(clips, index).astype(int)
+                assert frames.shape == (64, 3, 64, 64)
+                expected = shade(int(name[4]), np.arange(64))
+                assert np.abs(frames[:, :, 32, 32] - expected[:, None]).max() <= 8
+                assert np.abs(frames[:, :, 32, 2] - expected[:, None]).max() <= 12  # the black margin is cut off
+
+    def test_frames_in_natural_order_averaged_to_64(self, folder):
+        two_folders(folder)
+        Image.fromarray(np.arange(128 * 192 * 3, dtype=np.uint8).reshape(128, 192, 3)).save(folder / "b" / "frame5.png")
+        clips = {name: (side, i) for side in both(folder) for i, name in enumerate(side.names)}
+        assert sorted(clips) == ["a", "b"]
+        a, b = (shown(*clips[name]) for name in "ab")
+        assert a[:, 0, 9, 9].tolist() == list(range(20))  # not 0, 1, 10, 11, ...
+        assert (a[:, 1] == 1).all() and (a[:, 2] == 7).all()
+        original = np.arange(128 * 192 * 3, dtype=np.uint8).reshape(128, 192, 3)[:, 32:160].astype(float)
+        means = original.reshape(64, 2, 64, 2, 3).mean(axis=(1, 3)).transpose(2, 0, 1)
+        assert np.abs(b[5] - means).max() <= 1
+
+    def test_matroska_without_a_frame_count(self, folder):
+        for seed in range(2):
+            write_video(folder / f"{seed}.mkv", seed)
+        assert [clips.lengths.tolist() for clips in both(folder)] == [[64], [64]]
+
+    def test_in_the_environment(self, folder):
+        two_folders(folder)
+        env = DistractorPointMazeVectorEnv(2, videos=str(folder), split="eval", video_kwargs={"min_frames": 20})
+        pictures, _ = env.reset(seed=0)
+        name = load_backgrounds(folder, "eval").names[0]
+        behind = (pictures[:, 1] == {"a": 1, "b": 2}[name]) & (pictures[:, 2] == 7)
+        assert behind.mean() > 0.3
+        assert (pictures[0, 0][behind[0]] == env.factors()["frame"][0]).all()
+
+
+class TestCache:
+    def test_decoded_once_and_found_again_under_another_name(self, folder, cache, monkeypatch):
+        for seed in range(2):
+            write_video(folder / f"film{seed}.mp4", seed)
+        before = [clips.fingerprint for clips in both(folder)]
+        assert len(list(cache.glob("*.npy"))) == len(list(cache.iterdir())) // 2 == 2
+        digests = {clip.digest for clips in both(folder) for clip in clips.clips}
+        video.load_split.cache_clear()
+        monkeypatch.setattr(video, "decode_video", None)  # would raise if it were called
+        assert [clips.fingerprint for clips in both(folder)] == before
+        folder.rename(folder.with_name("moved"))
+        again = both(folder.with_name("moved"))
+        assert {clip.digest for clips in again for clip in clips.clips} == digests
+
+    def test_a_damaged_entry_is_decoded_again(self, folder, cache):
+        two_folders(folder)
+        expected = shown(load_backgrounds(folder, "train"))
+        path = next(cache.glob("*.npy"))
+        raw = bytearray(path.read_bytes())
+        raw[-100] ^= 1
+        path.write_bytes(raw)
+        video.load_split.cache_clear()
+        assert np.array_equal(shown(load_backgrounds(folder, "train")), expected)
+        raw[-100] ^= 1
+        assert path.read_bytes() == bytes(raw)
+
+    def test_a_changed_video_is_not_taken_from_the_cache(self, folder):
+        write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)
+        before = [clips.fingerprint for clips in both(folder)]
+        write_video(folder / "a.mp4", 3), write_video(folder / "b.mp4", 4)
+        after = [clips.fingerprint for clips in both(folder)]
+        assert not set(before) & set(after)
+
+    def test_frames_are_mapped_not_copied(self, folder):
+        two_folders(folder)
+        array = load_backgrounds(folder, "train").clips[0].load()
+        assert isinstance(array.base, np.memmap)
+
+    def test_folder(self, monkeypatch, tmp_path):
+        monkeypatch.delenv("SB3_ABISIM_CACHE")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        assert video.cache_folder() == tmp_path / "sb3_abisim"
+
+
+def listed(folder, **kwargs):
+    sides = split_sources(find_sources(folder), kwargs.get("seed", 0), kwargs.get("eval_fraction", 0.25))
+    return {side: {source.name: source.group for source in sources} for side, sources in sides.items()}
+
+
+class TestSplit:
+    def test_groups_stay_together(self, folder):
+        for film in range(8):
+            for shot in range(3):
+                (folder / f"film{film}").mkdir(exist_ok=True)
+                (folder / f"film{film}" / f"{shot}.mp4").touch()
+        names = ("Kitchen [abc-EFGH_12]-000.mp4", "x/Kitchen [abc-EFGH_12]-001.mp4", "y/abc-EFGH_12_000010_000020.mp4")
+        for name in names:
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).touch()
+        sides = listed(folder)
+        assert not set(sides["train"].values()) & set(sides["eval"].values())
+        assert len(sides["train"]) + len(sides["eval"]) == 27
+        assert len(set(sides["eval"].values())) == 2  # a quarter of nine
+        groups = sides["train"] | sides["eval"]
+        assert {groups[name] for name in names} == {"abc-EFGH_12"}
+        assert groups["film3/1.mp4"] == "film3"
+        assert listed(folder, seed=1) != sides == listed(folder)
+
+    def test_no_shared_frame(self, folder):
+        for i in range(5):
+            write_frames(folder / f"clip{i}", i)
+        hashes = [{f.tobytes() for i in range(side.n_clips) for f in shown(side, i)} for side in both(folder)]
+        assert [len(side) for side in hashes] == [80, 20] and not hashes[0] & hashes[1]
+
+    def test_folders_named_train_and_eval(self, folder):
+        for name in ("train/a/0.mp4", "train/b.mp4", "eval/a/0.mp4", "eval/c.mp4", "eval/d.mp4"):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).touch()
+        sides = listed(folder)
+        assert sorted(sides["train"]) == ["train/a/0.mp4", "train/b.mp4"]
+        assert sorted(sides["eval"]) == ["eval/a/0.mp4", "eval/c.mp4", "eval/d.mp4"]
+
+    def test_davis_root_uses_its_own_lists(self, folder):
+        lists = folder / "ImageSets" / "2017"
+        lists.mkdir(parents=True)
+        (lists / "train.txt").write_text("bear\nboat\n\n")
+        (lists / "val.txt").write_text("cows\n")
+        for seed, name in enumerate(("bear", "boat", "cows", "unlisted")):
+            write_frames(folder / "JPEGImages" / "480p" / name, seed, range(25), "{:05d}.jpg")
+        train, unseen = both(folder)
+        assert train.names == ("bear", "boat") and unseen.names == ("cows",)
+        assert train.lengths.tolist() == [25, 25]
+        (lists / "val.txt").write_text("camel\n")
+        with pytest.raises(ValueError, match=r"val\.txt lists 'camel'"):
+            find_sources(folder)
+        (lists / "val.txt").unlink()
+        with pytest.raises(ValueError, match=r"has no .*val\.txt; restore it"):
+            find_sources(folder)
+
+    def test_hidden_files_and_thumbnails_are_left_out(self, folder):
+        for name in ("a.mp4", "a.jpg", "._a.mp4", ".trash/b.mp4", "c/0.mp4"):
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).touch()
+        assert [source.name for source in find_sources(folder)] == ["a.mp4", "c/0.mp4"]
+
+    def test_one_group_leaves_a_side_empty(self, folder):
+        write_video(folder / "film" / "1.mp4"), write_video(folder / "film" / "2.mp4", 1)
+        with pytest.raises(ValueError, match=r"2 clips.*one group, 'film'.*add another video"):
+            load_backgrounds(folder)
+
+    def test_an_empty_side(self, folder):
+        (folder / "eval").mkdir()
+        write_video(folder / "train" / "1.mp4")
+        with pytest.raises(ValueError, match="eval side of the split has no clips"):
+            load_backgrounds(folder)
+
+    def test_the_same_content_on_both_sides(self, folder):
+        write_frames(folder / "a"), write_frames(folder / "b")
+        with pytest.raises(ValueError, match=r"[ab] \(train\) and .*[ab] \(eval\) have the same content; remove one"):
+            load_backgrounds(folder)
+
+
+class TestMistakes:
+    def test_missing_folder_and_file_instead_of_folder(self, folder):
+        with pytest.raises(ValueError, match=r"videos.nothing does not exist.*correct the path"):
+            load_backgrounds(folder / "nothing")
+        with pytest.raises(ValueError, match=r"a\.mp4 is a file; give the folder"):
+            load_backgrounds(write_video(folder / "a.mp4"))
+
+    def test_no_videos_says_what_was_found(self, folder):
+        with pytest.raises(ValueError, match="found an empty folder"):
+            load_backgrounds(folder)
+        for name in ("a.txt", "b.txt", "c.zip", "d"):
+            (folder / name).touch()
+        with pytest.raises(ValueError, match=r"no videos in .*2 x \.txt, 1 x .*; put video files \(.*\.mp4"):
+            load_backgrounds(folder)
+
+    def test_undecodable_video(self, folder):
+        for name in "abcd":
+            (folder / f"{name}.mp4").write_bytes(name.encode() * 5000)
+        with pytest.raises(video.ClipError, match=r"[a-d]\.mp4 cannot be decoded after 0 frames.*; replace the file"):
+            load_backgrounds(folder)
+
+    def test_undecodable_frame(self, folder):
+        for path in two_folders(folder):
+            (path / "frame7.png").write_bytes((path / "frame7.png").read_bytes()[:60])
+        with pytest.raises(video.ClipError, match=r"frame7\.png cannot be decoded"):
+            load_backgrounds(folder)
+
+    @pytest.mark.parametrize("suffix", ["mkv", "avi"])
+    def test_half_a_video(self, folder, suffix):
+        for seed in range(2):
+            path = write_video(folder / f"{seed}.{suffix}", seed, 200)
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        with pytest.raises(video.ClipError, match=rf"\.{suffix}"):
+            load_backgrounds(folder)
+
+    def test_half_a_matroska_file_says_how_many_frames_are_missing(self, folder):
+        path = write_video(folder / "half.mkv", 0, 200)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        with pytest.raises(video.ClipError, match=r"decoded \d+ of 200 frames of .*half\.mkv: the file is cut off"):
+            list(video.decode_video(path))
+
+    def test_damage_in_the_middle_that_the_decoder_conceals(self, folder):
+        path = write_video(folder / "a.mp4", 0, 100)
+        raw = bytearray(path.read_bytes())
+        middle = len(raw) // 2
+        raw[middle : middle + 300] = np.random.default_rng(0).bytes(300)
+        path.write_bytes(raw)
+        with pytest.raises(video.ClipError, match=r"frame \d+ of .*a\.mp4 is damaged; replace the file"):
+            list(video.decode_video(path))
+
+    def test_missing_frames_of_a_folder(self, folder):
+        for name in "ab":
+            write_frames(folder / name, ord(name), [n for n in range(10, 60, 2) if n != 34])
+        with pytest.raises(video.ClipError, match=r"24 of 25 frames: there is none between frame32\.png and frame36"):
+            load_backgrounds(folder)
+
+    def test_too_short(self, folder):
+        two_folders(folder)
+        assert load_backgrounds(folder, min_frames=20).lengths.tolist() == [20]
+        with pytest.raises(video.ClipError, match=r"[ab] has 20 frames, fewer than min_frames=21; give a longer"):
+            load_backgrounds(folder, min_frames=21)
+
+    def test_too_large_is_known_before_decoding(self, folder, monkeypatch):
+        write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)
+        monkeypatch.setattr(video, "decode_video", None)
+        with pytest.raises(ValueError, match=r"have 64 frames, but max_bytes allows 63 .*larger max_bytes"):
+            load_backgrounds(folder, max_bytes=64 * 12288 - 1)
+
+    def test_too_large_without_a_count_in_the_header(self, folder, monkeypatch):
+        write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)
+        monkeypatch.setattr(video, "_promise", lambda container, path: (None, 0.0))
+        with pytest.raises(ValueError, match=r"more than 63 frames, but max_bytes allows 63"):
+            load_backgrounds(folder, max_bytes=64 * 12288 - 1)
+        assert load_backgrounds(folder, max_bytes=64 * 12288).lengths.tolist() == [64]
+
+    @pytest.mark.parametrize("missing", ["av", "PIL.Image"])
+    def test_decoder_not_installed(self, folder, monkeypatch, missing):
+        write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)
+        monkeypatch.setitem(sys.modules, missing, None)
+        with pytest.raises(ImportError, match=r"pip install 'sb3_abisim\[video\]'"):
+            load_backgrounds(folder)
+
+    def test_skip_leaves_clips_out_and_says_which(self, folder):
+        for i in range(8):
+            write_frames(folder / f"good{i}", i)
+            (folder / f"bad{i}.mp4").write_bytes(f"{i}".encode() * 5000)
+        sides = []
+        for split in ("train", "eval"):
+            with pytest.warns(UserWarning, match=r"skipped \d+ of \d+ .*\n.*bad\d\.mp4 cannot be decoded"):
+                sides.append(load_backgrounds(folder, split, on_error="skip", eval_fraction=0.5))
+        assert sorted(sides[0].names + sides[1].names) == [f"good{i}" for i in range(8)]
+        assert len(sides[0].skipped) + len(sides[1].skipped) == 8
+        assert all("bad" in path and "cannot be decoded" in reason for path, reason in sides[0].skipped)
+
+    def test_skipping_every_clip_is_an_error(self, folder):
+        for name in "ab":
+            (folder / f"{name}.mp4").write_bytes(name.encode() * 5000)
+        with pytest.raises(ValueError, match=r"all 1 train clips .* were skipped"):
+            load_backgrounds(folder, on_error="skip")
+
+    @pytest.mark.parametrize(
+        "kwargs", [{"eval_fraction": 0.0}, {"eval_fraction": 1.0}, {"min_frames": 1}, {"on_error": "ignore"}]
+    )
+    def test_unknown_settings(self, folder, kwargs):
+        (name, value), *_ = kwargs.items()
+        with pytest.raises(ValueError, match=f"{name} must .*{value}"):
+            load_backgrounds(folder, **kwargs)
+
+
+def test_natural_key():
+    names = ["f10.png", "F9.png", "f1b.png", "f1.png", "10.png", "9.png"]
+    assert sorted(names, key=natural_key) == ["9.png", "10.png", "f1.png", "f1b.png", "F9.png", "f10.png"]

@@ -1,0 +1,400 @@
+"""The zoo's side: hyperparameters, methods, evaluation splits, and the commands themselves."""
+
+import argparse
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+import yaml
+from torch import nn
+
+from sb3_abisim import zoo
+from sb3_abisim.checkpoint import load_encoder, save_encoder
+from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.networks import make_encoder
+from sb3_abisim.resources import resource_path
+
+exp_manager = importlib.import_module("rl_zoo3.exp_manager")
+
+ROOT = Path(__file__).resolve().parent.parent
+ENTRIES = [
+    (path.stem, env_id)
+    for path in sorted(resource_path("hyperparams").glob("*.yml"))
+    for env_id in yaml.safe_load(path.read_text())
+]
+PRETRAINED = [name for name in zoo.EXTRACTORS if name not in zoo.UNTRAINED]
+SMALL = {
+    "ppo": ["n_envs:2", "n_steps:32", "batch_size:32"],
+    "dqn": ["buffer_size:500", "learning_starts:20"],
+    "sac": ["buffer_size:500", "learning_starts:280", "batch_size:8"],
+}
+
+
+def write_encoder(path: Path, env_id: str, objective: str = "abisim") -> str:
+    env = gym.make(env_id)
+    th.manual_seed(len(path.name))
+    return save_encoder(
+        path,
+        make_encoder(env.observation_space),
+        observation_space=env.observation_space,
+        action_space=env.action_space,
+        env_id=env_id,
+        env_kwargs={},
+        objective=objective,
+        settings={},
+        dataset_digest="0" * 64,
+        golden_observations=np.stack([env.reset(seed=seed)[0] for seed in range(2)]),
+    )
+
+
+@pytest.fixture
+def manager(tmp_path: Path) -> Any:
+    def make(algo: str, env_id: str, config: str | None = None, **kwargs: Any) -> Any:
+        args = argparse.Namespace(conf_file=config)
+        return exp_manager.ExperimentManager(args, algo, env_id, str(tmp_path), config=config, **kwargs)
+
+    return make
+
+
+def effective(manager: Any) -> dict[str, Any]:
+    """What the algorithm's constructor is given, with everything that goes elsewhere."""
+    hyperparams, saved = manager.read_hyperparameters()
+    rest = {key: saved[key] for key in ("n_envs", "n_timesteps", "monitor_kwargs", "callback") if key in saved}
+    processed = dict(manager._preprocess_hyperparams(hyperparams)[0])
+    for key in ("learning_rate", "clip_range"):
+        if key in processed:
+            processed[key] = processed[key](0.5)
+    return processed | rest | {"env_kwargs": manager.env_kwargs, "eval_env_kwargs": manager.eval_env_kwargs}
+
+
+# Methods.
+
+
+def test_method_words() -> None:
+    assert zoo.Method.parse("ssi") == zoo.Method("ssi", None, False)
+    assert zoo.Method.parse("abisim,frozen") == zoo.Method("abisim", None, True)
+    assert zoo.Method.parse("abisim=a=b,c.safetensors") == zoo.Method("abisim", "a=b,c.safetensors", False)
+    assert zoo.Method.parse("ssi=hf://o/r/f.safetensors,frozen") == zoo.Method("ssi", "hf://o/r/f.safetensors", True)
+
+
+@pytest.mark.parametrize("text", ["", "acroo", "abisim,freeze", "ssi=", "ssi=,frozen", "vanilla=x", "vanilla,frozen"])
+def test_wrong_method_words(text: str) -> None:
+    with pytest.raises(ValueError, match=r"give METHOD|takes neither"):
+        zoo.Method.parse(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "nonsense(",
+        "dict(net_arch=[1])",
+        "dict(features_extractor_kwargs=3)",
+        "dict(features_extractor_kwargs=get(1))",
+        "f(features_extractor_kwargs={'encoder': 'a/b'})",
+    ],
+)
+def test_policy_kwargs_of_another_form_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="policy_kwargs must read"):
+        zoo.Method("ssi").policy_kwargs(text)
+
+
+@pytest.mark.parametrize(("algo", "env_id"), ENTRIES)
+def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: str) -> None:
+    default = effective(manager(algo, env_id))
+    kwargs = default.pop("policy_kwargs")
+    shipped = kwargs["features_extractor_kwargs"]["encoder"]
+    assert kwargs["features_extractor_class"].__name__ == "ActionBisimExtractor"
+    for word, class_name, expected in [
+        ("abisim", "ActionBisimExtractor", {"encoder": shipped}),
+        ("abisim,frozen", "ActionBisimExtractor", {"encoder": shipped, "freeze": True}),
+        ("ssi", "SSIExtractor", {"encoder": shipped.replace("/abisim", "/ssi")}),
+        ("ssi=my runs/x.safetensors", "SSIExtractor", {"encoder": "my runs/x.safetensors"}),
+        ("vanilla", "VanillaExtractor", None),
+    ]:
+        other = effective(manager(algo, env_id, word))
+        other_kwargs = other.pop("policy_kwargs")
+        assert other == default
+        assert other_kwargs["features_extractor_class"].__name__ == class_name
+        assert other_kwargs.get("features_extractor_kwargs") == expected
+        differing = {key for key in kwargs | other_kwargs if kwargs.get(key) != other_kwargs.get(key)}
+        assert differing <= {"features_extractor_class", "features_extractor_kwargs"}
+
+
+# Hyperparameters.
+
+
+def test_the_yaml_is_a_plain_zoo_file(manager: Any) -> None:
+    for algo, env_id in ENTRIES:
+        as_file = effective(manager(algo, env_id, str(resource_path("hyperparams") / f"{algo}.yml")))
+        assert as_file == effective(manager(algo, env_id))
+
+
+def test_every_environment_has_hyperparameters() -> None:
+    assert {env_id for algo, env_id in ENTRIES if algo == "ppo"} == set(ENV_IDS)
+    assert {env_id for algo, env_id in ENTRIES if algo == "dqn"} == {i for i in ENV_IDS if i.startswith("Nav2D")}
+    assert {env_id for algo, env_id in ENTRIES if algo == "sac"} == {i for i in ENV_IDS if i.startswith("Continuous")}
+
+
+def test_the_papers_numbers(manager: Any) -> None:
+    for env_id in (env_id for env_id in ENV_IDS if "PointMaze" in env_id):
+        ppo = effective(manager("ppo", env_id))
+        assert ppo["n_envs"] * ppo["n_steps"] == 65536
+        assert (ppo["batch_size"], ppo["learning_rate"], ppo["n_timesteps"]) == (256, 0.000025, 7e6)
+        assert ppo["policy_kwargs"]["net_arch"] == [256] and ppo["policy_kwargs"]["activation_fn"] is nn.ReLU
+    dqn = effective(manager("dqn", "Nav2D-v0"))
+    assert (dqn["batch_size"], dqn["learning_rate"], dqn["gamma"], dqn["n_timesteps"]) == (32, 0.0001, 0.99, 2e6)
+    assert (dqn["exploration_initial_eps"], dqn["exploration_final_eps"]) == (0.9, 0.2)
+
+
+@pytest.mark.parametrize(("algo", "env_id"), ENTRIES)
+def test_every_entry_builds_its_model(manager: Any, tmp_path: Path, algo: str, env_id: str) -> None:
+    digest = write_encoder(tmp_path / "mine.safetensors", env_id)
+    given = dict(pair.split(":") for pair in SMALL[algo])
+    hyperparams = {key: int(value) for key, value in given.items()}
+    config = f"abisim={tmp_path / 'mine.safetensors'}"
+    model, saved = manager(algo, env_id, config, hyperparams=hyperparams, eval_freq=-1).setup_experiment()
+    part = model.actor if algo == "sac" else model.q_net if algo == "dqn" else model.policy
+    assert part.features_extractor.digest == digest
+    # Constructing the algorithm has left the weights as they are in the file, bit by bit.
+    weights = load_encoder(tmp_path / "mine.safetensors").encoder.state_dict()
+    assert all(th.equal(value, weights[name]) for name, value in part.features_extractor.encoder.state_dict().items())
+    assert isinstance(saved["policy_kwargs"], str)
+    # NatureCNN's defaults for net_arch, "no layers", must not reach our heads.
+    head = {"ppo": lambda: model.policy.value_net, "dqn": lambda: model.q_net.q_net[-1], "sac": lambda: model.actor.mu}
+    assert head[algo]().in_features == 256
+    model.env.close()
+
+
+def test_shipped_encoders() -> None:
+    """Needs the files under encoders/, which come from `python -m sb3_abisim.pretrain`."""
+    for algo, env_id in ENTRIES:
+        text = yaml.safe_load((resource_path("hyperparams") / f"{algo}.yml").read_text())[env_id]["policy_kwargs"]
+        folder = text.split("'encoder': '")[1].split("/")[0]
+        for method in PRETRAINED:
+            contract = load_encoder(f"{folder}/{method}").contract
+            assert (contract["env_id"], contract["objective"]) == (folder, method)
+            load_encoder(f"{folder}/{method}").check(gym.make(env_id).observation_space, gym.make(env_id).action_space)
+
+
+def test_other_environments_are_untouched(manager: Any) -> None:
+    ours, theirs = manager("ppo", "CartPole-v1"), manager("ppo", "CartPole-v1")
+    original = type(theirs).read_hyperparameters.__wrapped__
+    assert ours.read_hyperparameters() == original(theirs)
+    assert vars(ours) == vars(theirs)
+    assert Path(ours.config).parent.parent == Path(exp_manager.__file__).parent
+
+
+def test_an_own_file_is_read_as_it_is(manager: Any, tmp_path: Path) -> None:
+    (tmp_path / "own.yml").write_text("Nav2D-v0: {policy: MlpPolicy, n_timesteps: 7}\n")
+    assert dict(manager("a2c", "Nav2D-v0", str(tmp_path / "own.yml")).read_hyperparameters()[0]) == {
+        "policy": "MlpPolicy",
+        "n_timesteps": 7,
+    }
+
+
+def test_mistakes_are_refused(manager: Any) -> None:
+    with pytest.raises(ValueError, match=r"no hyperparameters of a2c for Nav2D-v0, only of: dqn, ppo"):
+        manager("a2c", "Nav2D-v0").read_hyperparameters()
+    with pytest.raises(ValueError, match=r"no hyperparameters of sac for PointMaze-v0, only of: ppo"):
+        manager("sac", "PointMaze-v0", "ssi").read_hyperparameters()
+    with pytest.raises(ValueError, match=r"'abisin' is no YAML.*one of abisim, ssi, vanilla"):
+        manager("ppo", "Nav2D-v0", "abisin").read_hyperparameters()
+    with pytest.raises(ValueError, match="give one of the two"):
+        manager("ppo", "Nav2D-v0", "ssi", hyperparams={"policy_kwargs": "dict()"}).read_hyperparameters()
+    with pytest.raises(ValueError, match="--trial-id would replace policy_kwargs"):
+        manager("ppo", "Nav2D-v0", trial_id=3).read_hyperparameters()
+
+
+def test_installing_again_changes_nothing() -> None:
+    cls = exp_manager.ExperimentManager
+    before = dict(vars(cls))
+    zoo.install()
+    importlib.reload(zoo)
+    assert dict(vars(cls)) == before
+
+
+# Evaluation on unseen clips.
+
+
+@pytest.mark.parametrize("config", [None, "vanilla", str(ROOT / "hyperparams" / "ppo.yml")])
+def test_evaluation_is_on_unseen_clips(manager: Any, config: str | None) -> None:
+    def kwargs(env_id: str = "DistractorPointMaze-v0", **given: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        one = manager("ppo", env_id, config, **given)
+        one._preprocess_hyperparams(one.read_hyperparameters()[0])
+        return one.env_kwargs, one.eval_env_kwargs
+
+    assert kwargs() == ({}, {"split": "eval"})
+    assert kwargs(env_kwargs={"order": "shuffled"}) == ({"order": "shuffled"}, {"order": "shuffled", "split": "eval"})
+    only = {"split": "clean", "clips": ["sea"], "reward": "binary"}
+    assert kwargs(env_kwargs=only) == (only, {"reward": "binary", "split": "eval"})
+    assert kwargs(eval_env_kwargs={"split": "clean"}) == ({}, {"split": "clean"})
+    assert kwargs(eval_env_kwargs={"order": "shuffled"}) == ({}, {"order": "shuffled", "split": "eval"})
+    in_yaml = {"env_kwargs": {"order": "shuffled"}}
+    assert kwargs(hyperparams=in_yaml) == ({"order": "shuffled"}, {"order": "shuffled", "split": "eval"})
+    # Choosing hyperparameters must not look at the evaluation clips.
+    assert kwargs(optimize_hyperparameters=True, n_evaluations=1) == ({}, {})
+    assert kwargs("PointMaze-v0") == ({}, {})
+
+
+def test_evaluation_environments_show_the_clips_of_their_split(manager: Any) -> None:
+    train, unseen = (gym.make("DistractorPointMaze-v0", split=split).unwrapped for split in ("train", "eval"))
+    small = {"n_envs": 1, "n_steps": 8, "batch_size": 8}
+    one = manager("ppo", "DistractorPointMaze-v0", "vanilla", eval_freq=-1, hyperparams=small)
+    model, _ = one.setup_experiment()
+    create_test_env = importlib.import_module("rl_zoo3").create_test_env
+    envs = [
+        model.env,
+        one.create_envs(1, eval_env=True),
+        create_test_env("DistractorPointMaze-v0", should_render=False, hyperparams={}),
+    ]
+    shown = [env.get_attr("fingerprint")[0] for env in envs]
+    for env in envs:
+        env.close()
+    assert shown == [train.fingerprint, unseen.fingerprint, unseen.fingerprint]
+    assert train.fingerprint != unseen.fingerprint
+
+
+def test_enjoy_is_on_unseen_clips() -> None:
+    seen: list[Any] = []
+    make = zoo._test_env_maker(lambda env_id, *args, **kwargs: seen.append(kwargs["env_kwargs"]))
+    make("DistractorPointMaze-v0", env_kwargs={"order": "shuffled"})
+    make("DistractorPointMaze-v0", env_kwargs={"split": "train"})
+    make("DistractorPointMaze-v0", env_kwargs={"clips": ["sea"]})
+    make("ContinuousDistractorPointMaze-v0", n_envs=2, env_kwargs=None)
+    make("PointMaze-v0", env_kwargs=None)
+    assert seen == [
+        {"order": "shuffled", "split": "eval"},
+        {"split": "train"},
+        {"clips": ["sea"]},
+        {"split": "eval"},
+        None,
+    ]
+    for name in ("rl_zoo3", "rl_zoo3.utils"):
+        assert hasattr(importlib.import_module(name).create_test_env, "__wrapped__")
+
+
+# The commands.
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *argv: str) -> None:
+    monkeypatch.setattr(sys, "argv", [])
+    zoo.main(list(argv))
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id", "method"),
+    [
+        ("ppo", "Nav2D-v0", "ssi,frozen"),
+        ("ppo", "PointMaze-v0", "vanilla"),
+        ("dqn", "Nav2D-v0", "abisim"),
+        ("sac", "ContinuousPointMaze-v0", "abisim"),
+    ],
+)
+def test_train_and_enjoy(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    algo: str,
+    env_id: str,
+    method: str,
+) -> None:
+    digest, word, encoder = "", method, tmp_path / "mine.safetensors"
+    if method != "vanilla":
+        name, comma, frozen = method.partition(",")
+        digest = write_encoder(encoder, env_id, name)
+        word = f"{name}={encoder}{comma}{frozen}"
+    common = ["--algo", algo, "--env", env_id, "-f", str(tmp_path), "--num-threads", "1"]
+    small = ["--eval-freq", "200", "--eval-episodes", "1", "-params", *SMALL[algo]]
+    run(monkeypatch, "train", *common, "-n", "300", "--seed", "1", "--conf-file", word, *small)
+    out = capsys.readouterr().out
+    state = "frozen" if method.endswith("frozen") else "trained along"
+    # One line for each network with an encoder of its own.
+    assert out.count("Encoder ") == (2 if algo == "sac" else 1)
+    assert f"sha256 {digest}" in out if digest else "random weights" in out
+    assert state in out and "| encoder/ " in out
+    folder = tmp_path / algo / f"{env_id}_1"
+    evaluations = np.load(folder / "evaluations.npz")
+    assert evaluations["successes"].shape == (1, 1)
+    assert "is_success" in (folder / "0.monitor.csv").read_text().splitlines()[1].split(",")
+    # A run folder is complete in itself: the encoder file may be gone.
+    encoder.unlink(missing_ok=True)
+    run(monkeypatch, "enjoy", *common, "-n", "130", "--no-render")
+    assert "Mean reward" in capsys.readouterr().out
+
+
+def test_a_mistyped_encoder_stops_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    argv = ["train", "--algo", "dqn", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "300", "--eval-freq", "-1"]
+    with pytest.raises(FileNotFoundError, match=r"no encoder file 'tpyo\.safetensors'"):
+        run(monkeypatch, *argv, "--conf-file", "abisim=tpyo.safetensors", "-params", *SMALL["dqn"])
+
+
+def test_optimize_keeps_the_encoder(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    digest = write_encoder(tmp_path / "mine.safetensors", "Nav2D-v0")
+    models: list[Any] = []
+    ppo = exp_manager.ALGOS["ppo"]
+
+    def make(*args: Any, **kwargs: Any) -> Any:
+        models.append(ppo(*args, **kwargs))
+        return models[-1]
+
+    def sample(*_: Any) -> dict[str, Any]:
+        return {"n_steps": 16, "batch_size": 16, "policy_kwargs": {"net_arch": [7], "activation_fn": nn.Tanh}}
+
+    monkeypatch.setitem(exp_manager.ALGOS, "ppo", make)
+    monkeypatch.setitem(exp_manager.HYPERPARAMS_SAMPLER, "ppo", sample)
+    argv = ["train", "--algo", "ppo", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "64", "--no-optim-plots"]
+    argv += ["-optimize", "--n-trials", "2", "--n-evaluations", "1", "--num-threads", "1"]
+    run(monkeypatch, *argv, "--conf-file", f"abisim={tmp_path / 'mine.safetensors'}")
+    assert len(models) == 2
+    for model in models:
+        assert model.policy.features_extractor.digest == digest
+        assert model.policy.mlp_extractor.policy_net[0].out_features == 7
+    assert capsys.readouterr().out.count(digest) == 2
+
+
+def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        zoo.main(["trian", "--algo", "ppo"])
+    assert stopped.value.code == 2 and "train" in capsys.readouterr().err
+
+
+def _python(*argv: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    return subprocess.run([sys.executable, *argv], cwd=cwd, env=environment, capture_output=True, text=True)
+
+
+def test_plain_zoo_command_in_the_checkout(tmp_path: Path) -> None:
+    """Needs the encoders that ship, like test_shipped_encoders."""
+    argv = ["--algo", "ppo", "--env", "DistractorPointMaze-v0", "-f", str(tmp_path), "--num-threads", "1"]
+    small = ["-n", "64", "--eval-freq", "-1", "-params", *SMALL["ppo"]]
+    done = _python("-m", "rl_zoo3.train", *argv, *small, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert f"Loading hyperparameters from: {ROOT / 'hyperparams' / 'ppo.yml'}" in done.stdout
+    digest = load_encoder("DistractorPointMaze-v0/abisim").digest
+    assert f"ActionBisimExtractor, source DistractorPointMaze-v0/abisim, sha256 {digest}" in done.stdout
+    done = _python("-m", "rl_zoo3.enjoy", *argv, "-n", "130", "--no-render", cwd=ROOT)
+    assert done.returncode == 0 and "Mean reward: -" in done.stdout, done.stderr
+
+
+def test_zoo_command_elsewhere(tmp_path: Path) -> None:
+    argv = ["--algo", "ppo", "--env", "Nav2D-v0", "-n", "64", "--eval-freq", "-1"]
+    argv += ["--gym-packages", "sb3_abisim.zoo", "--conf-file", "vanilla", "-params", *SMALL["ppo"]]
+    done = _python("-m", "rl_zoo3.train", *argv, cwd=tmp_path)
+    assert done.returncode == 0 and "Encoder features_extractor: VanillaExtractor" in done.stdout, done.stderr
+
+
+def test_install_from_within_the_import_of_the_zoo() -> None:
+    """Programs that import ExperimentManager first import custom_envs while that module is half done."""
+    code = "from rl_zoo3.exp_manager import ExperimentManager as E; import rl_zoo3.exp_manager as m;"
+    code += "assert E.sb3_abisim_installed and m.ExperimentManager is E"
+    done = _python("-c", code, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
