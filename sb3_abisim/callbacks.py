@@ -20,7 +20,7 @@ class EncoderCallback(BaseCallback):
         require_weights(self.model)
         self._extractors = [extractor for _, extractor in find_extractors(self.model.policy)]
         for name, extractor in find_extractors(self.model.policy):
-            origin = f"sha256 {extractor.digest}" if extractor.digest else "random weights"
+            origin = f"digest {extractor.digest}" if extractor.digest else "random weights"
             state = "frozen" if extractor.frozen else "trained along"
             print(
                 f"Encoder {name}: {type(extractor).__name__}, source {extractor.source}, {origin}, "

@@ -11,6 +11,7 @@ import difflib
 import errno
 import importlib
 import json
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +35,7 @@ from sb3_abisim.dataset_format import (
 )
 from sb3_abisim.dataset_writer import Segment, check_folder, open_writer
 
-# A shard holds at least this many transitions, and whole time limits of episodes where the environment has one.
+# A shard holds about this many transitions, in whole time limits of episodes where the environment has one.
 SHARD_TRANSITIONS = 8192
 MAX_SHARD_BYTES = 2**30
 
@@ -120,7 +121,7 @@ def _collect(
             size = min(per_shard, n_transitions - k * per_shard)
             if writer.has_shard(k, size):
                 bar.update(size)
-                bar.initial += size  # keeps the rate that of new transitions
+                bar.initial = getattr(bar, "initial", 0) + size  # keeps the rate that of new transitions
                 continue
             shard_seed = np.random.SeedSequence(seed, spawn_key=(k,))
             writer.write_shard(k, collect_shard(env, steps, size, shard_seed, bar.update))
@@ -228,12 +229,14 @@ def _steps_per_shard(env: VectorEnv[Any, Any, Any], env_id: str, env_kwargs: dic
     """Steps of each copy: whole time limits, so that late stages of episodes are seen as often as early ones."""
     spec = gym.registry[env_id]
     limit = int(env_kwargs.get("max_episode_steps") or spec.max_episode_steps or 1)
-    steps = -(-SHARD_TRANSITIONS // (env.num_envs * limit)) * limit
-    size = steps * env.num_envs * int(np.prod(env.single_observation_space.shape or ()))
-    if size > MAX_SHARD_BYTES:
+    row = math.prod(env.single_observation_space.shape or ())
+    steps = max(1, min(SHARD_TRANSITIONS, MAX_SHARD_BYTES // row) // (env.num_envs * limit)) * limit
+    if steps * env.num_envs * row > MAX_SHARD_BYTES:
+        most = MAX_SHARD_BYTES // (limit * row)
+        remedy = f"use --n-envs {most} or fewer" if most else "use shorter ones: --env-kwargs max_episode_steps:K"
         raise ValueError(
-            f"{env.num_envs} environments with episodes of {limit} steps need {size / 1e9:.1f} GB of memory for a "
-            f"shard; use --n-envs {max(1, env.num_envs * MAX_SHARD_BYTES // size)} or fewer"
+            f"a shard of {env.num_envs} episodes of {limit} steps would take "
+            f"{steps * env.num_envs * row / 2**30:.1f} GiB of memory, more than {MAX_SHARD_BYTES / 2**30:.1f}; {remedy}"
         )
     return steps
 

@@ -78,11 +78,11 @@ def check_folder(folder: Path) -> None:
 def open_writer(folder: Path, identity: dict[str, Any]) -> Iterator["DatasetWriter"]:
     """Begin a dataset, or go on with one that has the same identity; no other process can write meanwhile.
 
-    :param folder: the dataset's folder, made if absent
+    :param folder: the dataset's folder, made if absent; a caller that computes before writing calls
+        :func:`check_folder` first
     :param identity: the keys ``IDENTITY_KEYS``, in JSON types
     :raises ValueError: if the folder is something else or was begun with another identity, or is being written
     """
-    check_folder(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with folder_lock(folder):
         check_folder(folder)

@@ -4,6 +4,7 @@ An encoder takes what Stable-Baselines3 hands to a features extractor: float ima
 trains on -1..+1, so that affine map is the encoder's first layer.
 """
 
+import itertools
 from typing import Any
 
 import gymnasium as gym
@@ -38,7 +39,8 @@ class Encoder(nn.Module):
         :param observations: float (batch, channels, height, width) in 0..1
         :return: float (batch, features_dim)
         """
-        features: th.Tensor = self.layers(2.0 * observations - 1.0)
+        # 2 x - 1 in one pass over memory.
+        features: th.Tensor = self.layers(th.add(-1.0, observations, alpha=2.0))
         return features
 
 
@@ -93,7 +95,7 @@ class PointMazeEncoder(Encoder):
 ENCODERS: dict[str, type[Encoder]] = {cls.__name__: cls for cls in (Nav2DEncoder, PointMazeEncoder)}
 
 
-def make_encoder(observation_space: gym.Space, name: str | None = None, **kwargs: Any) -> Encoder:
+def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **kwargs: Any) -> Encoder:
     """Build an encoder for an observation space.
 
     :param observation_space: a channels-first image space
@@ -128,6 +130,6 @@ class MLP(nn.Sequential):
 
     def __init__(self, *dims: int) -> None:
         layers: list[nn.Module] = []
-        for n_in, n_out in zip(dims[:-1], dims[1:], strict=True):
+        for n_in, n_out in itertools.pairwise(dims):
             layers += [nn.Linear(n_in, n_out), nn.ReLU()]
         super().__init__(*layers[:-1])

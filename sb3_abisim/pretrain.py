@@ -9,6 +9,7 @@ same machine type, package versions, device type and thread count).
 
 import argparse
 import dataclasses
+import itertools
 import json
 import platform
 import shlex
@@ -68,8 +69,9 @@ def pretrain(
     output = Path(output)
     if output.suffix != ".safetensors":
         raise ValueError(f"the output must end in .safetensors, got {output}")
-    dataset = TransitionDataset(data)
-    config = config or load_config(objective, dataset.env_id)
+    env_id = read_env_id(Path(data))
+    config = config or load_config(objective, env_id)
+    dataset = TransitionDataset(data, holdout=config.holdout)
     if objective == "abisim" and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
         pretrain("ssi", data, base, seed=seed, device=device, progress_bar=progress_bar, verbose=verbose)
@@ -119,7 +121,7 @@ class _Run:
         }
         if base is not None:
             base_file = load_encoder(base)
-            _require_same_space(base_file.contract, dataset)
+            base_file.check(dataset.observation_space, dataset.action_space)
             objective_kwargs["base_encoder"] = base_file.encoder
             self.settings["base_digest"] = base_file.digest
             self.settings["base_objective"] = base_file.contract["objective"]
@@ -133,7 +135,7 @@ class _Run:
         # Channels last is the layout in which small convolutions are fastest on CPUs; the numbers are the same.
         self.module: Objective = module.to(self.device, memory_format=th.channels_last)  # type: ignore[call-overload]
         trained = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
-        self.optimizer = th.optim.Adam(trained, lr=config.learning_rate)
+        self.optimizer = th.optim.Adam(trained, lr=config.learning_rate_at(0))
         self.n_updates = 0
         self.rows: list[dict[str, float]] = []
 
@@ -207,12 +209,16 @@ class _Run:
 
         dataset = self.dataset
         changed = {k: v for k, v in dataclasses.asdict(self.config).items() if v != getattr(PretrainConfig(), k)}
-        collect = f"python -m sb3_abisim.collect --env {dataset.env_id} -n {dataset.n_transitions}"
+        collect = f"python -m sb3_abisim.collect --env {dataset.env_id} -n {dataset.n_transitions} -o DATA"
+        for flag, value in (("--seed", dataset.meta["seed"]), ("--n-envs", dataset.meta["n_envs"])):
+            collect += "" if value is None else f" {flag} {value}"
+        if dataset.env_kwargs:
+            collect += f" --env-kwargs {shlex.join(f'{k}:{v!r}' for k, v in dataset.env_kwargs.items())}"
         command = f"python -m sb3_abisim.pretrain --objective {self.settings['objective']} --env {dataset.env_id}"
         return {
             "settings": self.settings,
             "commands": [
-                f"{collect} --seed {dataset.meta['seed']} -o DATA",
+                collect,
                 f"{command} --seed {self.seed} --data DATA -o FILE"
                 + "".join(f" -params {shlex.quote(f'{k}:{json.dumps(v)}')}" for k, v in changed.items()),
             ],
@@ -267,6 +273,8 @@ class _Run:
         import torch as th
 
         self.module.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate_at(self.n_updates)
         loss, terms = self.module.loss(batch)
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -275,8 +283,8 @@ class _Run:
         for name, value in {"loss": loss, **terms, "gradient norm": norm}.items():
             if not bool(th.isfinite(value)):
                 raise FloatingPointError(
-                    f"{name} is {float(value)} at update {self.n_updates}: the weights were left as they were and "
-                    f"checkpoints stay in {self.folder}; try a smaller learning_rate"
+                    f"{name} is {float(value.detach())} at update {self.n_updates}: the weights were left as they were "
+                    f"and checkpoints stay in {self.folder}; try a smaller learning_rate"
                 )
         self.optimizer.step()
         self.module.after_step()
@@ -285,8 +293,8 @@ class _Run:
 
     def _batches(self) -> Iterator["TensorBatch"]:
         """The batches from the present position to the end; a position is (epoch, batch within it)."""
-        config, part = self.config, "train" if self.config.holdout else None
-        per_epoch = len(self.dataset.valid_starts(config.k, part=part)) // config.batch_size
+        config = self.config
+        per_epoch = len(self.dataset.valid_starts(config.k, part="train")) // config.batch_size
         if per_epoch == 0:
             raise ValueError(
                 f"the dataset has too few transitions for a batch of {config.batch_size}; "
@@ -294,7 +302,7 @@ class _Run:
             )
         while self.n_updates < config.n_updates:
             epoch, start = divmod(self.n_updates, per_epoch)
-            batches = self.dataset.batches(config.batch_size, config.k, self.seed, epoch, start, part=part)
+            batches = self.dataset.batches(config.batch_size, config.k, self.seed, epoch, start, part="train")
             for batch in batches:
                 yield self._to_tensors(batch)
                 if self.n_updates >= config.n_updates:
@@ -307,17 +315,14 @@ class _Run:
 
         from sb3_abisim.objectives import TensorBatch
 
-        space, device = self.dataset.observation_space, self.device
+        space = self.dataset.observation_space
+        # Bytes are put in channels-last order before they become floats, four times as large.
         observations, next_observations = (
-            preprocess_obs(th.as_tensor(frames).to(device), space)
+            preprocess_obs(th.as_tensor(frames).contiguous(memory_format=th.channels_last).to(self.device), space)
             for frames in (batch.observations, batch.next_observations)
         )
         assert isinstance(observations, th.Tensor) and isinstance(next_observations, th.Tensor)
-        return TensorBatch(
-            observations.contiguous(memory_format=th.channels_last),
-            th.as_tensor(batch.actions).to(device),
-            next_observations.contiguous(memory_format=th.channels_last),
-        )
+        return TensorBatch(observations, th.as_tensor(batch.actions).to(self.device), next_observations)
 
     def _log(self, logger: "Logger", sums: dict[str, float]) -> None:
         row = {f"train/{name}": value / self.config.log_interval for name, value in sums.items()}
@@ -336,9 +341,11 @@ class _Run:
             return {}
         self.module.eval()
         means: dict[str, float] = {}
-        batches = self.dataset.batches(self.config.batch_size, self.config.k, self.seed, part="test")
+        n_test = len(self.dataset.valid_starts(self.config.k, part="test"))
+        batch_size = min(self.config.batch_size, n_test)
+        batches = self.dataset.batches(batch_size, self.config.k, self.seed, part="test")
         with th.no_grad(), th.random.fork_rng(devices=[]):
-            rows = [self.module.loss(self._to_tensors(b))[1] for b, _ in zip(batches, range(N_HOLDOUT_BATCHES))]
+            rows = [self.module.loss(self._to_tensors(b))[1] for b in itertools.islice(batches, N_HOLDOUT_BATCHES)]
         for name in rows[0] if rows else ():
             means[name] = sum(float(row[name]) for row in rows) / len(rows)
         return means
@@ -354,17 +361,19 @@ class _Run:
                 for row in self.rows:
                     values = {"time/n_updates": row["n_updates"], **row}
                     del values["n_updates"]
-                    output.write(dict(sorted(values.items())), {key: () for key in values})
+                    output.write(dict(sorted(values.items())), dict.fromkeys(values, ()))
         return logger
 
 
-def _require_same_space(contract: dict[str, Any], dataset: "TransitionDataset") -> None:
-    shape = list(dataset.observation_space.shape or ())
-    if list(contract["observation"]["shape"]) != shape:
-        raise ValueError(
-            f"the base encoder takes observations of shape {contract['observation']['shape']}, "
-            f"the dataset holds {shape}"
-        )
+def read_env_id(data: Path) -> str:
+    """The environment id of a finished dataset, without opening the rest of it.
+
+    :raises ValueError: if the folder holds none
+    """
+    meta_path = data / "meta.json"
+    if not meta_path.is_file():
+        raise ValueError(f"{data} holds no finished dataset (no meta.json); run sb3_abisim.collect first")
+    return str(json.loads(meta_path.read_text())["env_id"])
 
 
 def _refuse_other_settings(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
@@ -409,19 +418,14 @@ def main(argv: list[str] | None = None) -> None:
     data = Path(args.data)
     try:
         config = load_config(args.objective, args.env, _parse_overrides(args.params))
-        meta_path = data / "meta.json"
-        if not meta_path.is_file():
-            raise ValueError(f"{data} holds no finished dataset (no meta.json); run sb3_abisim.collect first")
-        env_id = json.loads(meta_path.read_text())["env_id"]
+        env_id = read_env_id(data)
         if env_id != args.env:
             raise ValueError(f"{data} was collected in {env_id}, not in {args.env}")
     except (ValueError, yaml.YAMLError) as error:
         parser.error(str(error))
     try:
-        pretrain(
-            args.objective, data, args.output, config, args.base, args.seed, args.device, verbose=args.verbose
-        )
-    except ValueError as error:
+        pretrain(args.objective, data, args.output, config, args.base, args.seed, args.device, verbose=args.verbose)
+    except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     except FloatingPointError as error:
         sys.exit(f"error: {error}")

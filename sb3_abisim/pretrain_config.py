@@ -15,7 +15,8 @@ class PretrainConfig:
 
     :param n_updates: optimiser steps
     :param batch_size: transitions per update
-    :param learning_rate: of Adam
+    :param learning_rate: of Adam; a number keeps it constant, ``lin_NUMBER`` lowers it in a straight line to 0, as in
+        the zoo's files
     :param k: steps between the two observations of a transition
     :param holdout: share of the episodes that is only evaluated on, 0 <= holdout < 1
     :param log_interval: updates between two rows of the log
@@ -27,7 +28,7 @@ class PretrainConfig:
 
     n_updates: int = 20_000
     batch_size: int = 256
-    learning_rate: float = 1e-4
+    learning_rate: float | str = 1e-4
     k: int = 1
     holdout: float = 0.05
     log_interval: int = 500
@@ -41,10 +42,22 @@ class PretrainConfig:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
-        if not self.learning_rate > 0:
+        if not self.learning_rate_at(0) > 0:
             raise ValueError(f"learning_rate must be above 0, got {self.learning_rate!r}")
         if not 0 <= self.holdout < 1:
             raise ValueError(f"holdout must lie in [0, 1), got {self.holdout!r}")
+
+    def learning_rate_at(self, n_updates: int) -> float:
+        """The learning rate of the update that follows ``n_updates`` others."""
+        if not isinstance(self.learning_rate, str):
+            return self.learning_rate
+        try:
+            initial = float(self.learning_rate.removeprefix("lin_"))
+        except ValueError:
+            initial = 0.0
+        if not self.learning_rate.startswith("lin_") or not initial > 0:
+            raise ValueError(f"learning_rate must be a number or lin_NUMBER, got {self.learning_rate!r}")
+        return initial * (1.0 - n_updates / self.n_updates)
 
     @classmethod
     def from_mapping(cls, mapping: dict[str, Any]) -> "PretrainConfig":

@@ -15,9 +15,7 @@ from sb3_abisim.atomic import write_atomic
 _DIGEST_BYTES = 32
 
 
-def save_training_state(
-    path: Path, module: nn.Module, optimizer: th.optim.Optimizer, metadata: dict[str, Any]
-) -> None:
+def save_training_state(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, metadata: dict[str, Any]) -> None:
     """Write a checkpoint, whole or not at all; a sha256 of the content stands at its end.
 
     :param path: the file

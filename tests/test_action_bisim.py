@@ -43,9 +43,7 @@ def make_batch(action_space=DISCRETE, n=6):
         if isinstance(action_space, gym.spaces.Discrete)
         else 2 * th.rand(n, 2, generator=generator) - 1
     )
-    return TensorBatch(
-        th.rand(n, 1, 1, 4, generator=generator), actions, th.rand(n, 1, 1, 4, generator=generator)
-    )
+    return TensorBatch(th.rand(n, 1, 1, 4, generator=generator), actions, th.rand(n, 1, 1, 4, generator=generator))
 
 
 def l1(x, y):

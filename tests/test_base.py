@@ -45,7 +45,10 @@ def test_batch_of_n_equals_n_single_environments(env_id):
         for i, env in enumerate(singles):
             last, reward, *done, info = env.step(actions[i])
             assert (reward, *done, info["is_success"]) == (
-                rewards[i], terminated[i], truncated[i], infos["is_success"][i]
+                rewards[i],
+                terminated[i],
+                truncated[i],
+                infos["is_success"][i],
             )
             if any(done):
                 ended += 1

@@ -87,7 +87,7 @@ def test_ppo(encoder: tuple[str, str], freeze: bool, capsys: pytest.CaptureFixtu
     n_parameters = sum(p.numel() for p in make_encoder(Grid.observation_space).parameters())
     state = "frozen" if freeze else "trained along"
     assert lines == [
-        f"Encoder features_extractor: ActionBisimExtractor, source {path}, sha256 {digest}, "
+        f"Encoder features_extractor: ActionBisimExtractor, source {path}, digest {digest}, "
         f"{n_parameters} parameters, {state}"
     ]
     assert len(drift) == 3 and drift[0] == 0.0

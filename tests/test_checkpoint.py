@@ -32,7 +32,7 @@ def seeded_encoder(seed: int = 0) -> Encoder:
 
 
 def save(path: Path, encoder: Encoder | None = None, **changes: Any) -> str:
-    arguments = {
+    arguments: dict[str, Any] = {
         "observation_space": SPACE,
         "action_space": ACTIONS,
         "env_id": "Nav2D-v0",

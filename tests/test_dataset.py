@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine shards of a few dozen index-valued frames each."""
     path = tmp_path_factory.mktemp("data") / "index"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collect_module, "SHARD_TRANSITIONS", 40)
+        patch.setattr(collect_module, "SHARD_TRANSITIONS", 48)
         collect_module.collect("IndexEnv-v0", N, path, n_envs=4, seed=3)
     return path
 

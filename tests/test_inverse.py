@@ -129,7 +129,9 @@ def test_penalty_makes_the_embedding_ignore_what_actions_do_not_move():
         for name, column in (("controlled", 0), ("uncontrolled", 2)):
             moved = batch.observations.clone()
             moved[..., column] += 0.3
-            change[name] = float((objective.encoder(moved) - objective.encoder(batch.observations)).abs().sum().detach())
+            change[name] = float(
+                (objective.encoder(moved) - objective.encoder(batch.observations)).abs().sum().detach()
+            )
         sensitivity[penalty] = change["uncontrolled"] / change["controlled"]
     assert sensitivity[0.1] < 0.4 * sensitivity[0.0]
 
@@ -146,9 +148,7 @@ def test_adaptive_beta_follows_the_previous_accuracy():
     assert objective.accuracy == before, "evaluation must not change the schedule"
 
 
-@pytest.mark.parametrize(
-    "kwargs", [{"l1_penalty": -1.0}, {"l1_penalty": math.nan}, {"adaptive": "sometimes"}], ids=str
-)
+@pytest.mark.parametrize("kwargs", [{"l1_penalty": -1.0}, {"l1_penalty": math.nan}, {"adaptive": "sometimes"}], ids=str)
 def test_refuses_bad_settings(kwargs):
     with pytest.raises(ValueError, match=str(next(iter(kwargs.values())))):
         InverseDynamics(LineEncoder(), DISCRETE, **kwargs)

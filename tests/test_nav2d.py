@@ -46,7 +46,9 @@ def test_steps_follow_the_rules(env_id):
             observation, reward, terminated, truncated, info = env.step(action)
             (x, y), now, _ = cells(observation)
             assert ((x, y), now) == (expected, obstacles)
-            assert (reward, terminated, info["is_success"]) == ((0.0, True, True) if expected == goal else (-1.0, False, False))
+            assert (reward, terminated, info["is_success"]) == (
+                (0.0, True, True) if expected == goal else (-1.0, False, False)
+            )
             assert truncated == (step == 50 and not terminated)
             if terminated or truncated:
                 successes += terminated
@@ -63,8 +65,11 @@ def test_layouts_leave_a_path_and_hold_2x2_obstacles():
         counts.append(len(obstacles))
         assert goal in reachable(agent, obstacles) and agent not in obstacles and goal not in obstacles
         for x, y in obstacles:
-            assert any({(x - i, y - j), (x + 1 - i, y - j), (x - i, y + 1 - j), (x + 1 - i, y + 1 - j)} <= obstacles
-                       for i in (0, 1) for j in (0, 1))
+            assert any(
+                {(x - i, y - j), (x + 1 - i, y - j), (x - i, y + 1 - j), (x + 1 - i, y + 1 - j)} <= obstacles
+                for i in (0, 1)
+                for j in (0, 1)
+            )
     assert len(starts) > 150, "the agent starts anywhere"
     # 20 blocks of 4 cells at random positions overlap; by simulation 66 cells are covered on average.
     assert 60 < np.mean(counts) < 70 and max(counts) <= 80

@@ -77,6 +77,19 @@ def test_a_batch_equals_its_pictures_drawn_alone() -> None:
         np.testing.assert_array_equal(together[i][:, far], backgrounds[i][:, far])
 
 
+def test_drawing_over_another_picture_mixes_with_that_one() -> None:
+    generator = np.random.default_rng(4)
+    pictures, over = generator.integers(256, size=(2, 6, 3, SIZE, SIZE), dtype=np.uint8)
+    centres = generator.uniform(2, SIZE - 2, (6, 2))
+    painter = DiscPainter(RADIUS, SIZE)
+    alone, touched = over.copy(), np.zeros((6, SIZE, SIZE), dtype=bool)
+    painter.draw(alone, centres)
+    painter.mark(touched, centres)
+    expected = np.where(touched[:, None], alone, pictures)
+    painter.draw(pictures, centres, over=over)
+    np.testing.assert_array_equal(pictures, expected)
+
+
 def test_mark_is_the_set_of_pixels_that_draw_mixes() -> None:
     centres = np.random.default_rng(2).uniform(2, SIZE - 2, (50, 2))
     painter = DiscPainter(RADIUS, SIZE, (255, 255, 255))

@@ -183,7 +183,9 @@ class BackgroundPlayer:
 
     def pictures(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
         """What is now shown behind the environments ``indices``: a new array, uint8 (len(indices), 3, 64, 64)."""
-        return self.backgrounds.frames(self.clip[indices], self.frame[indices])
+        # Positions that are not shuffled need no folding here, `frames` does it.
+        frame = self._position if self._shuffles is None else self.frame
+        return self.backgrounds.frames(self.clip[indices], frame[indices])
 
 
 def composite(

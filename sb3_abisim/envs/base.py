@@ -40,8 +40,8 @@ class BatchEnv(gym.vector.VectorEnv):
     def __init__(
         self,
         num_envs: int,
-        observation_space: gym.Space,
-        action_space: gym.Space,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         autoreset: bool = True,
@@ -62,7 +62,12 @@ class BatchEnv(gym.vector.VectorEnv):
         self._autoreset = autoreset
         self._generators: list[np.random.Generator] = []
         self._elapsed = np.zeros(num_envs, dtype=np.int64)
-        self._finished = np.ones(num_envs, dtype=bool)
+        self._everyone = np.arange(num_envs)
+        self._always = np.ones(num_envs, dtype=bool)
+        self._needs_reset = True
+        self._action_shape = (num_envs, *(action_space.shape or ()))
+        self._action_kinds = "iu" if isinstance(action_space, gym.spaces.Discrete) else "iuf"
+        self._action_bounds = _bounds(action_space)
 
     # The dynamics, written by subclasses over index arrays.
 
@@ -116,14 +121,13 @@ class BatchEnv(gym.vector.VectorEnv):
                 self._generators.append(seeding.np_random(one)[0])
             elif one is not None:
                 self._generators[i] = seeding.np_random(one)[0]
-        everyone = np.arange(self.num_envs)
-        self._begin(everyone)
-        return self._observe(everyone), {}
+        self._begin(self._everyone)
+        self._needs_reset = False
+        return self._observe(self._everyone), {}
 
     def _begin(self, indices: NDArray[np.int64]) -> None:
         self._reset_envs(indices)
         self._elapsed[indices] = 0
-        self._finished[indices] = False
 
     def step(
         self, actions: Any
@@ -135,22 +139,22 @@ class BatchEnv(gym.vector.VectorEnv):
         :raises RuntimeError: before the first reset, or for a finished copy that was not reset
         """
         actions = self._check_actions(actions)
-        if self._finished.any():
+        if self._needs_reset:
             raise RuntimeError("the episode is over (or has not begun): call reset() before step()")
         rewards, reached = self._advance(actions)
         self._elapsed += 1
-        if self.max_episode_steps is None:
-            truncated = np.zeros(self.num_envs, dtype=bool)
-        else:
-            truncated = (self._elapsed >= self.max_episode_steps) & ~reached
-        done = reached | truncated
-        infos: dict[str, Any] = {"is_success": reached.copy(), "_is_success": np.ones(self.num_envs, dtype=bool)}
-        everyone = np.arange(self.num_envs)
-        observations = self._observe(everyone)
-        if done.any():
-            self._finished |= done
+        truncated, done = np.zeros(self.num_envs, dtype=bool), reached
+        if self.max_episode_steps is not None:
+            done = reached | (self._elapsed >= self.max_episode_steps)
+            truncated = done & ~reached
+        infos: dict[str, Any] = {"is_success": reached.copy(), "_is_success": self._always.copy()}
+        observations = self._observe(self._everyone)
+        # Counting is the fastest way to see whether there is any.
+        if np.count_nonzero(done):
             if self._autoreset:
                 infos |= self._restart(np.flatnonzero(done), observations, infos)
+            else:
+                self._needs_reset = True
         return observations, rewards, reached, truncated, infos
 
     def _restart(
@@ -162,7 +166,7 @@ class BatchEnv(gym.vector.VectorEnv):
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in ended:
             final_obs[i] = observations[i].copy()
-        final_factors = {name: np.where(_along(mask, array), array, 0) for name, array in self.factors().items()}
+        final_factors = {name: np.where(_along(mask, array), array, np.zeros_like(array)) for name, array in self.factors().items()}
         self._begin(ended)
         observations[ended] = self._observe(ended)
         final_info = {
@@ -174,27 +178,21 @@ class BatchEnv(gym.vector.VectorEnv):
         return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
 
     def _check_actions(self, actions: Any) -> NDArray[Any]:
-        space, array = self.single_action_space, np.asarray(actions)
-        expected = (self.num_envs, *(space.shape or ()))
-        if array.shape != expected:
-            raise ValueError(f"actions must have shape {expected}, got shape {array.shape}: {actions!r}")
-        if isinstance(space, gym.spaces.Discrete):
-            if not np.issubdtype(array.dtype, np.integer):
-                raise ValueError(f"actions must be integers, got dtype {array.dtype}: {actions!r}")
-            low, high = int(space.start), int(space.start + space.n - 1)
-        else:
-            assert isinstance(space, gym.spaces.Box)
-            if not np.issubdtype(array.dtype, np.number):
-                raise ValueError(f"actions must be numbers, got dtype {array.dtype}: {actions!r}")
-            low, high = space.low, space.high  # type: ignore[assignment]
+        array = np.asarray(actions)
+        if array.shape != self._action_shape:
+            raise ValueError(f"actions must have shape {self._action_shape}, got shape {array.shape}: {actions!r}")
+        if array.dtype.kind not in self._action_kinds:
+            kind = "integers" if self._action_kinds == "iu" else "numbers"
+            raise ValueError(f"actions must be {kind}, got dtype {array.dtype}: {actions!r}")
+        low, high = self._action_bounds
         # Written so that NaN, which compares false, counts as out of range.
         inside = (array >= low) & (array <= high)
-        if not inside.all():
+        if np.count_nonzero(inside) < inside.size:
             bad = array[~inside.reshape(self.num_envs, -1).all(axis=1)][0]
-            raise ValueError(f"action {bad!r} is outside {space}; clip or rescale it before step()")
+            raise ValueError(f"action {bad!r} is outside {self.single_action_space}; clip or rescale it before step()")
         return array
 
-    def render(self) -> tuple[NDArray[np.uint8], ...] | None:  # type: ignore[override]
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture of every copy, each (height, width, 3) uint8 RGB; None without ``render_mode``."""
         if self.render_mode is None:
             return None
@@ -215,7 +213,7 @@ class SingleEnv(gym.Env):
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
-        self.batch = self.batch_class(num_envs=1, render_mode=render_mode, autoreset=False, **kwargs)  # type: ignore[call-arg]
+        self.batch = self.batch_class(num_envs=1, render_mode=render_mode, autoreset=False, **kwargs)
         self.render_mode = render_mode
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
@@ -243,10 +241,18 @@ class SingleEnv(gym.Env):
         """The simulator's state behind the current observation, for probes; see :meth:`BatchEnv.factors`."""
         return {name: array[0] for name, array in self.batch.factors().items()}
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """A picture that a person can look at, (height, width, 3) uint8 RGB; None without ``render_mode``."""
         frames = self.batch.render()
         return None if frames is None else frames[0]
+
+
+def _bounds(space: gym.Space[Any]) -> tuple[Any, Any]:
+    """The least and the greatest action, inclusive."""
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.start), int(space.start + space.n - 1)
+    assert isinstance(space, gym.spaces.Box)
+    return space.low, space.high
 
 
 def _along(mask: NDArray[np.bool_], array: NDArray[Any]) -> NDArray[np.bool_]:

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.envs.backgrounds import N_DRAWS, SPLITS, BackgroundPlayer, composite, load_backgrounds
+from sb3_abisim.envs.backgrounds import N_DRAWS, SPLITS, BackgroundPlayer, load_backgrounds
 from sb3_abisim.envs.base import SingleEnv
-from sb3_abisim.envs.point_maze import PointMazeVectorEnv, to_pixels
+from sb3_abisim.envs.point_maze import PointMazeVectorEnv
 
 
 class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
@@ -86,16 +86,14 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
     def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
         if self._player is None:
             return super()._observe(indices)
-        masks = self._solid[indices]
-        self._agent.mark(masks, to_pixels(self._position[indices]))
-        return composite(super()._observe(indices), masks, self._player.pictures(indices))
+        return self._observe_over(self._player.pictures(indices), indices)
 
     def _backdrop(self, index: int) -> NDArray[np.uint8]:
         layer: NDArray[np.uint8] = super()._backdrop(index)
         if self._player is None:
             return layer
         background = self._player.pictures(np.array([index]))
-        composite(layer[None], self._solid[index][None], background)
+        self._lay_over(background, np.array([index]))
         picture: NDArray[np.uint8] = background[0]
         return picture
 

@@ -28,14 +28,24 @@ DAMPING = 1.0
 FRICTION = 0.5
 MAX_VELOCITY = 5.0  # m/s per axis
 SUBSTEPS = 30
+_MASS = 1000.0 * 4 / 3 * np.pi * BALL_RADIUS**3
+# Between the ball and what it might touch, beyond MuJoCo's own contact margin of 2 mm.
+_CLEARANCE = 0.02  # m
 
-# From rest no velocity is above MAX_VELOCITY before any of this many substeps, so that clipping would change nothing:
-# an obstacle that the ball has dented pushes it out at 1.5 m/s at most, and a push adds 0.24 m/s per substep.
-_UNCLIPPED_SUBSTEPS = 16
-_FASTEST = np.array(MAX_VELOCITY)
+# Time steps that cannot bring a freely pushed ball to this speed need no clip: what contacts add, when they turn the
+# ball or an obstacle that it has dented pushes it out, stays below the 1 m/s left.
+_SAFE_VELOCITY = 4.0
+_FASTEST, _SLOWEST = np.array(MAX_VELOCITY), np.array(-MAX_VELOCITY)
 
 _N_WALLS = 4
 _CENTRE = IMAGE_SIZE // 2
+
+# The pixels (left, top, right, bottom) of a box in metres, the last two exclusive, with the room that a ball takes.
+_BOX_MARGINS = _CENTRE + PIXELS_PER_METRE * (BALL_RADIUS + _CLEARANCE) * np.array((-1, -1, 1, 1)) + (0, 0, 1, 1)
+# From them to the box's corners in a flattened table of counts; with the signs, what the box holds of those counted.
+_ROW = IMAGE_SIZE + 1
+_BOX_CORNERS = np.array([(1, 0, 1, 0), (_ROW, _ROW, 0, 0), (0, 1, 0, 1), (0, 0, _ROW, _ROW)])
+_CORNER_SIGNS = np.array((1, -1, -1, 1))
 
 
 def to_pixels(positions: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -105,6 +115,32 @@ def _connected(blocks: int, start: int, goal: int) -> bool:
     return True
 
 
+def free_displacement(forces: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """How far one step moves the ball from rest where nothing is in its way: MuJoCo's Euler integration, summed up.
+
+    With the damping taken implicitly, as MuJoCo does, a time step turns the velocity v into decay * v + push, and the
+    clip, once it bites, bites before each of the remaining time steps.
+
+    :param forces: -1..1, any shape
+    :return: m, same shape
+    """
+    forces = forces.astype(np.float64)
+    reach = np.searchsorted(_SPEEDS, MAX_VELOCITY / np.maximum(np.abs(forces), 1e-9), side="right")
+    n_free = np.minimum(reach, SUBSTEPS)
+    clipped_speed = _DECAY * MAX_VELOCITY * np.sign(forces) + _PUSH * forces
+    distance: NDArray[np.float64] = forces * _DISTANCES[n_free] + (SUBSTEPS - n_free) * TIMESTEP * clipped_speed
+    return distance
+
+
+_DECAY = 1 / (1 + TIMESTEP * DAMPING / _MASS)
+_PUSH = _DECAY * TIMESTEP * GEAR / _MASS
+_N_UNCLIPPED = int(_SAFE_VELOCITY / _PUSH)
+# Of a ball pushed with full force, after 0 to SUBSTEPS time steps without the clip.
+_SPEEDS = _PUSH * (1 - _DECAY ** np.arange(SUBSTEPS + 1)) / (1 - _DECAY)
+_DISTANCES = TIMESTEP * np.cumsum(_SPEEDS)
+_N_FREE = int(np.count_nonzero(_SPEEDS < MAX_VELOCITY)) - 1  # time steps before the first clip of a free ball
+
+
 def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], int, NDArray[np.float64]]:
     """Draw the obstacles and the start of an episode, until a corridor 0.5 m wide joins start and goal.
 
@@ -128,12 +164,11 @@ def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], int,
             return corners, occupied, to_metres(np.array([column + 1, row + 1]) + jitter)
 
 
-def _static_layer(occupied: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The picture without agent (3, 64, 64), and the mask (64, 64) of everything in it that is not floor."""
+def _static_layer(solid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The picture without agent, (3, 64, 64), from where walls and obstacles are."""
     layer = _EMPTY_LAYER.copy()
-    solid = _unpack(occupied)
     top_down.paint(layer, solid & ~_WALL_MASK, top_down.OBSTACLE)
-    return layer, solid | _GOAL_MASK
+    return layer
 
 
 def point_model() -> mujoco.MjModel:
@@ -178,7 +213,9 @@ class PointMazeVectorEnv(BatchEnv):
     **Physics.** MuJoCo on the point body of gymnasium-robotics: a ball of 4.19 kg and 0.1 m radius, joint damping 1,
     friction 0.5, time step 0.01 s, velocity clipped to 5 m/s per axis before every time step. A step of the
     environment is 30 time steps. It begins from rest, so that one picture is the whole state, and a push covers about
-    1 m of free floor; ``momentum=True`` keeps the velocity instead.
+    1 m of free floor; ``momentum=True`` keeps the velocity instead. Time steps from rest
+    in which the ball can touch nothing are summed in closed form (:func:`free_displacement`, equal to MuJoCo's to
+    1e-12 m); MuJoCo simulates the others.
 
     **Observation.** uint8 (3, 64, 64), RGB: light floor, dark walls and obstacles, a green square of 1 m at the goal,
     and the agent as a red disc of 0.3 m radius, antialiased, so that its position can be read to a fraction of a
@@ -232,8 +269,14 @@ class PointMazeVectorEnv(BatchEnv):
         self._force = self._physics.bind("ctrl")
         self._obstacle_pos = self._physics.expand("geom_pos")[:, _N_WALLS : _N_WALLS + N_OBSTACLES, :2]
         self._layers = np.zeros((num_envs, *pictures.shape), dtype=np.uint8)
-        self._solid = np.zeros((num_envs, IMAGE_SIZE, IMAGE_SIZE), dtype=bool)
+        # 255 where floor is seen, and the layer elsewhere: to lay the layer over other pictures by bitwise operations.
+        self._floor = np.zeros((num_envs, 1, IMAGE_SIZE, IMAGE_SIZE), dtype=np.uint8)
+        self._standing = np.zeros_like(self._layers)
         self._agent = top_down.DiscPainter(AGENT_RADIUS * PIXELS_PER_METRE, IMAGE_SIZE)
+        # [row, column]: how many pixels above and to the left are walls or obstacles.
+        self._solid_counts = np.zeros((num_envs, IMAGE_SIZE + 1, IMAGE_SIZE + 1), dtype=np.int64)
+        self._first_count = self._everyone[:, None] * (IMAGE_SIZE + 1) ** 2
+        self._pushes = free_displacement(DIRECTIONS)
 
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
@@ -241,27 +284,92 @@ class PointMazeVectorEnv(BatchEnv):
             corners, occupied, start = draw_layout(self._generators[i])
             self._obstacle_pos[i] = to_metres(corners + OBSTACLE_PIXELS / 2)
             self._position[i] = start
-            self._layers[i], self._solid[i] = _static_layer(occupied)
+            solid = _unpack(occupied)
+            self._solid_counts[i, 1:, 1:] = solid.cumsum(axis=0).cumsum(axis=1)
+            self._layers[i] = _static_layer(solid)
+            self._floor[i] = np.where(solid | _GOAL_MASK, 0, 255)
+            self._standing[i] = self._layers[i] & ~self._floor[i]
 
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         self._force[:] = actions if self.continuous else DIRECTIONS[actions]
-        clipped = SUBSTEPS
-        if not self.momentum:
-            self._velocity[:] = 0.0
-            self._physics.step(nstep=_UNCLIPPED_SUBSTEPS)
-            clipped -= _UNCLIPPED_SUBSTEPS
-        for _ in range(clipped):
-            np.minimum(self._velocity, _FASTEST, out=self._velocity)
-            np.maximum(self._velocity, -_FASTEST, out=self._velocity)
-            self._physics.step()
+        if self.momentum:
+            self._simulate(None, SUBSTEPS)
+        else:
+            self._move_from_rest(free_displacement(actions) if self.continuous else self._pushes[actions])
         reached = np.hypot(self._position[:, 0], self._position[:, 1]) <= GOAL_RADIUS
         rewards = reached - 1.0 if self.reward_type == "step" else reached.astype(np.float64)
         return rewards, reached
+
+    def _move_from_rest(self, displacements: NDArray[np.float64]) -> None:
+        """Move the balls that nothing is in the way of by ``displacements``; MuJoCo simulates the others.
+
+        A ball that meets something only in the last time steps is moved freely up to them.
+        """
+        targets = self._position + displacements
+        touching = self._solid_between(self._position, targets)
+        if not np.count_nonzero(touching):
+            self._position[:] = targets
+            return
+        halfway = self._position + self._force * _DISTANCES[_N_FREE]
+        early = self._solid_between(self._position, halfway) & touching
+        late = touching & ~early
+        np.copyto(self._position, targets, where=~touching[:, None])
+        np.copyto(self._position, halfway, where=late[:, None])
+        np.multiply(self._force, _SPEEDS[_N_FREE] * late[:, None], out=self._velocity)
+        if np.count_nonzero(early):
+            self._simulate_from_rest(early)
+        if np.count_nonzero(late):
+            self._simulate(self._some(late), SUBSTEPS - _N_FREE)
+
+    def _some(self, mask: NDArray[np.bool_]) -> NDArray[np.int64] | None:
+        """Indices for the physics, None for all, which is faster."""
+        return None if np.count_nonzero(mask) == self.num_envs else np.flatnonzero(mask)
+
+    def _simulate_from_rest(self, mask: NDArray[np.bool_]) -> None:
+        """The time steps of one step; those that no clip can concern in as few calls as possible."""
+        indices = self._some(mask)
+        self._physics.step(indices, nstep=_N_UNCLIPPED)
+        remaining = SUBSTEPS - _N_UNCLIPPED
+        if np.abs(self._velocity[mask]).max() + remaining * _PUSH < _SAFE_VELOCITY:
+            self._physics.step(indices, nstep=remaining)
+        else:
+            self._simulate(indices, remaining)
+
+    def _simulate(self, indices: NDArray[np.int64] | None, substeps: int) -> None:
+        for _ in range(substeps):
+            np.minimum(self._velocity, _FASTEST, out=self._velocity)
+            np.maximum(self._velocity, _SLOWEST, out=self._velocity)
+            self._physics.step(indices)
+
+    def _solid_between(self, starts: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether the box that a ball sweeps from start to end holds any solid pixel, shape (num_envs,)."""
+        box = np.empty((self.num_envs, 4))
+        np.minimum(starts, ends, out=box[:, :2])
+        np.maximum(starts, ends, out=box[:, 2:])
+        pixels = (box * PIXELS_PER_METRE + _BOX_MARGINS).astype(np.int64)
+        np.maximum(pixels, 0, out=pixels)
+        np.minimum(pixels, IMAGE_SIZE, out=pixels)
+        counts = self._solid_counts.reshape(-1)[pixels @ _BOX_CORNERS + self._first_count]
+        solid: NDArray[np.bool_] = counts @ _CORNER_SIGNS > 0
+        return solid
 
     def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
         pictures = self._layers[indices]
         self._agent.draw(pictures, to_pixels(self._position[indices]))
         return pictures
+
+    def _observe_over(self, backgrounds: NDArray[np.uint8], indices: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """The observations with pictures in place of the floor.
+
+        Pixels that agent, obstacles, goal or walls touch, the agent's antialiased edge among them, have the bytes of
+        the plain observation.
+
+        :param backgrounds: contiguous, shape (len(indices), 3, 64, 64), overwritten
+        :return: ``backgrounds``
+        """
+        self._lay_over(backgrounds, indices)
+        self._agent.draw(backgrounds, to_pixels(self._position[indices]), over=self._layers[indices])
+        return backgrounds
 
     def _foreground(self, indices: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         """The observations, and which of their pixels show something other than floor.
@@ -269,9 +377,14 @@ class PointMazeVectorEnv(BatchEnv):
         :return: pictures (n, 3, 64, 64); masks (n, 64, 64), true where the agent (at any coverage), an obstacle, a
             wall or the goal is seen. Both are new arrays.
         """
-        masks = self._solid[indices]
+        masks = self._floor[indices, 0] == 0
         self._agent.mark(masks, to_pixels(self._position[indices]))
         return self._observe(indices), masks
+
+    def _lay_over(self, backgrounds: NDArray[np.uint8], indices: NDArray[np.int64]) -> None:
+        """Replace the floor of the static layers by pictures, in place: shape (len(indices), 3, 64, 64)."""
+        np.bitwise_and(backgrounds, self._floor[indices], out=backgrounds)
+        np.bitwise_or(backgrounds, self._standing[indices], out=backgrounds)
 
     def _backdrop(self, index: int) -> NDArray[np.uint8]:
         """The picture of one copy without its agent, shape (3, 64, 64); what ``render`` enlarges."""

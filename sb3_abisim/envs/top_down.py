@@ -103,11 +103,14 @@ class DiscPainter:
         whole, part = fine >> _SUBPIXEL_BITS, fine & (SUBPIXELS - 1)
         return whole @ self._weights, self._alphas[part @ _PART_WEIGHTS]
 
-    def draw(self, pictures: NDArray[np.uint8], centres: NDArray[np.float64]) -> None:
+    def draw(
+        self, pictures: NDArray[np.uint8], centres: NDArray[np.float64], over: NDArray[np.uint8] | None = None
+    ) -> None:
         """Draw the discs in place.
 
         :param pictures: contiguous, shape (n, 3, size, size)
         :param centres: (column, row) in pixels, shape (n, 2)
+        :param over: what the discs' edges mix with, contiguous and shaped like ``pictures``; None for ``pictures``
         :raises ValueError: where a disc, or the pixel beside it, would lie outside the picture
         """
         first, alphas = self._locate(centres)
@@ -115,7 +118,9 @@ class DiscPainter:
         starts = first + np.arange(len(pictures)) * (3 * self.size**2)
         where = starts[:, None, None] + self._channels
         alpha = alphas[:, None, :].astype(np.uint32)
-        flat[where] = (flat[where] * (255 - alpha) + self._colour * alpha + 127) // 255
+        below = flat[where] if over is None else over.reshape(-1)[where]
+        mixed = (below * (255 - alpha) + self._colour * alpha + 127) // 255
+        flat[where] = mixed if over is None else np.where(alpha > 0, mixed, flat[where])
 
     def mark(self, masks: NDArray[np.bool_], centres: NDArray[np.float64]) -> None:
         """Set the pixels that the discs touch, in place.

@@ -28,6 +28,7 @@ at an interval, starting from the base encoder's weights.
 
 import copy
 import math
+from typing import Any
 
 import gymnasium as gym
 import torch as th
@@ -106,7 +107,8 @@ class ForwardModel(nn.Module):
     def nll(self, phi: th.Tensor, actions: th.Tensor, phi_next: th.Tensor) -> th.Tensor:
         """Eq. 6: negative log-likelihood of the next embedding, mean over batch and dimensions."""
         mean, std = self(phi, actions)
-        return -th.distributions.Normal(mean, std).log_prob(phi_next).mean()
+        log_prob: th.Tensor = th.distributions.Normal(mean, std).log_prob(phi_next)  # type: ignore[no-untyped-call]
+        return -log_prob.mean()
 
     def reset(self) -> None:
         """Draw new weights."""
@@ -136,7 +138,7 @@ class ActionBisimulation(Objective):
     def __init__(
         self,
         encoder: Encoder,
-        action_space: gym.Space,
+        action_space: gym.Space[Any],
         base_encoder: Encoder,
         c: float = 0.9,
         tau: float = 0.01,

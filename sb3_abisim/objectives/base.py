@@ -1,7 +1,7 @@
 """The contract between an objective and the training loop."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import torch as th
@@ -36,7 +36,7 @@ class Objective(nn.Module):
 
     name: ClassVar[str]
 
-    def __init__(self, encoder: Encoder, action_space: gym.Space) -> None:
+    def __init__(self, encoder: Encoder, action_space: gym.Space[Any]) -> None:
         super().__init__()
         discrete = isinstance(action_space, gym.spaces.Discrete) and action_space.start == 0
         box = isinstance(action_space, gym.spaces.Box) and len(action_space.shape) == 1

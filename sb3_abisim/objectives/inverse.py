@@ -16,6 +16,7 @@ continuous prediction is taken to be its coefficient of determination, clipped t
 """
 
 import math
+from typing import Any
 
 import gymnasium as gym
 import torch as th
@@ -68,7 +69,7 @@ class InverseDynamics(Objective):
     name = "ssi"
 
     def __init__(
-        self, encoder: Encoder, action_space: gym.Space, l1_penalty: float = 1e-4, adaptive: str | None = None
+        self, encoder: Encoder, action_space: gym.Space[Any], l1_penalty: float = 1e-4, adaptive: str | None = None
     ) -> None:
         super().__init__(encoder, action_space)
         if not 0 <= l1_penalty < math.inf:
@@ -104,6 +105,6 @@ class InverseDynamics(Objective):
             return log_prob, (outputs.argmax(dim=1) == actions).float().mean()
         mean, log_std = outputs.chunk(2, dim=1)
         log_std = log_std.clamp(*_LOG_STD_RANGE)
-        log_prob = th.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=1)
+        log_prob = th.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=1)  # type: ignore[no-untyped-call]
         unexplained = (mean - actions).pow(2).sum() / (actions - actions.mean(dim=0)).pow(2).sum()
         return log_prob, (1.0 - unexplained).clamp(0.0, 1.0).detach()

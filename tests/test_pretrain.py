@@ -1,0 +1,278 @@
+"""The pretraining loop: what it writes, that an interruption changes nothing, and that it refuses what does not fit."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+
+import pytest
+import torch as th
+
+from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.collect import main as collect
+from sb3_abisim.objectives import InverseDynamics
+from sb3_abisim.pretrain import main, pretrain
+from sb3_abisim.pretrain_config import PretrainConfig, load_config
+
+SETTINGS = {"n_updates": 30, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "nav2d"
+    collect(["--env", "Nav2D-v0", "-n", "2000", "-o", str(folder), "--n-envs", "8"])
+    return folder
+
+
+def run(data, output, objective="ssi", **settings):
+    config = load_config(objective, "Nav2D-v0", {**SETTINGS, **settings})
+    return pretrain(objective, data, output, config, device="cpu", progress_bar=False, verbose=0)
+
+
+def test_writes_encoder_card_and_log(data, tmp_path):
+    output = run(data, tmp_path / "ssi.safetensors")
+    file = load_encoder(str(output))
+    assert file.contract["objective"] == "ssi" and file.contract["env_id"] == "Nav2D-v0"
+    card = json.loads(output.with_suffix(".json").read_text())
+    assert card["curves"]["n_updates"] == [5, 10, 15, 20, 25, 30]
+    assert card["metrics"]["test/accuracy"] == card["curves"]["test/accuracy"][-1]
+    assert card["settings"]["batch_size"] == 32
+    assert "--seed 0" in card["commands"][1]
+    log = output.with_suffix(".run") / "progress.csv"
+    assert len(log.read_text().splitlines()) == 7
+    assert not list(output.with_suffix(".run").glob("checkpoint*")), "checkpoints go when the run is over"
+    assert list(output.with_suffix(".run").glob("events.out.tfevents*"))
+
+
+def test_abisim_trains_its_base_first(data, tmp_path, monkeypatch):
+    small = load_config("ssi", "Nav2D-v0", SETTINGS)
+    monkeypatch.setattr("sb3_abisim.pretrain.load_config", lambda objective, env_id: small)
+    output = run(data, tmp_path / "abisim.safetensors", "abisim")
+    base = load_encoder(str(tmp_path / "abisim.base.safetensors"))
+    contract = load_encoder(str(output)).contract
+    assert base.contract["objective"] == "ssi" and contract["objective"] == "abisim"
+    assert contract["settings"]["base_digest"] == base.digest
+
+
+class Interrupted(Exception):
+    pass
+
+
+@pytest.mark.parametrize("objective", ["ssi", "abisim"])
+@pytest.mark.parametrize("stop_at", [3, 12, 29])
+def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, objective, stop_at):
+    kwargs = {}
+    base = str(run(data, tmp_path / "base.safetensors"))
+    config = load_config(objective, "Nav2D-v0", SETTINGS)
+    if objective == "abisim":
+        kwargs["base"] = base
+    # Different folders, equal names: what is compared must not hold the path.
+    outputs = [tmp_path / name / "encoder.safetensors" for name in ("whole", "stopped")]
+    pretrain(objective, data, outputs[0], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
+    from sb3_abisim.pretrain import _Run
+
+    update, count = _Run._update, 0
+
+    def interrupt(self, batch):
+        nonlocal count
+        count += 1
+        if count == stop_at:
+            raise Interrupted
+        return update(self, batch)
+
+    monkeypatch.setattr(_Run, "_update", interrupt)
+    with pytest.raises(Interrupted):
+        pretrain(objective, data, outputs[1], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
+    assert not outputs[1].exists()
+    pretrain(objective, data, outputs[1], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
+    # Went on from the checkpoint at the last multiple of 5 before the stop.
+    assert count == stop_at + 30 - (stop_at - 1) // 5 * 5
+    for suffix in (".safetensors", ".json"):
+        assert outputs[0].with_suffix(suffix).read_bytes() == outputs[1].with_suffix(suffix).read_bytes()
+    rows = [sorted(p.with_suffix(".run").joinpath("progress.csv").read_text().splitlines()) for p in outputs]
+    assert len(rows[0]) == len(rows[1]) == 7
+
+
+def test_killed_command_goes_on_to_the_same_bytes(data, tmp_path):
+    def command(folder):
+        words = [f"{k}:{v}" for k, v in {**SETTINGS, "n_updates": 60}.items()]
+        return [
+            sys.executable,
+            "-m",
+            "sb3_abisim.pretrain",
+            "--objective",
+            "ssi",
+            "--env",
+            "Nav2D-v0",
+            "--data",
+            str(data),
+            "-o",
+            str(folder / "ssi.safetensors"),
+            "--device",
+            "cpu",
+            "--verbose",
+            "0",
+            "-params",
+            *words,
+        ]
+
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run(command(tmp_path / "whole"), check=True, env=environment, capture_output=True)
+    process = subprocess.Popen(command(tmp_path / "killed"), env=environment, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("killed/ssi.run/checkpoint-*")):
+        assert process.poll() is None and time.monotonic() < deadline, "the run must reach its first checkpoint"
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    subprocess.run(command(tmp_path / "killed"), check=True, env=environment, capture_output=True)
+    for name in ("ssi.safetensors", "ssi.json"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes()
+
+
+def test_finished_run_is_left_alone_and_other_settings_are_refused(data, tmp_path):
+    output = run(data, tmp_path / "ssi.safetensors")
+    before = output.stat().st_mtime_ns
+    run(data, output)
+    assert output.stat().st_mtime_ns == before
+    with pytest.raises(ValueError, match=r"n_updates: 30 there, 40 here"):
+        run(data, output, n_updates=40)
+
+
+def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):
+    from sb3_abisim.pretrain import _Run
+
+    monkeypatch.setattr(_Run, "finish", lambda self: None)
+    run(data, tmp_path / "ssi.safetensors")
+    with pytest.raises(ValueError, match="other settings"):
+        run(data, tmp_path / "ssi.safetensors", learning_rate=0.5)
+
+
+def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
+    from sb3_abisim.pretrain import _Run
+
+    monkeypatch.setattr(_Run, "finish", lambda self: None)
+    run(data, tmp_path / "ssi.safetensors")
+    path = sorted((tmp_path / "ssi.run").glob("checkpoint-*"))[-1]
+    content = bytearray(path.read_bytes())
+    for position in (3, len(content) // 2, len(content) - 1):
+        damaged = bytearray(content)
+        damaged[position] ^= 1
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="damaged"):
+            run(data, tmp_path / "ssi.safetensors")
+
+
+def test_keeps_the_last_two_checkpoints(data, tmp_path, monkeypatch):
+    from sb3_abisim.pretrain import _Run
+
+    monkeypatch.setattr(_Run, "finish", lambda self: None)
+    run(data, tmp_path / "ssi.safetensors")
+    names = [path.name for path in sorted((tmp_path / "ssi.run").glob("checkpoint-*"))]
+    assert names == ["checkpoint-000000025.safetensors", "checkpoint-000000030.safetensors"]
+
+
+@pytest.mark.parametrize("where", ["loss", "gradient"])
+def test_stops_at_numbers_that_are_not_finite(data, tmp_path, monkeypatch, where):
+    plain, calls = InverseDynamics.loss, 0
+
+    def broken(self, batch):
+        nonlocal calls
+        calls += self.training
+        loss, terms = plain(self, batch)
+        if self.training and calls == 8:
+            if where == "loss":
+                loss = loss * float("nan")
+            else:
+                weight = self.encoder.layers[0].weight
+                loss = loss + 0.0 * th.sqrt(weight.sum() * 0.0)  # the value is 0, its derivative is not
+        return loss, terms
+
+    monkeypatch.setattr(InverseDynamics, "loss", broken)
+    with pytest.raises(FloatingPointError, match=f"{where}.* at update 7.*learning_rate"):
+        run(data, tmp_path / "ssi.safetensors")
+    assert not (tmp_path / "ssi.safetensors").exists()
+    assert [path.name for path in (tmp_path / "ssi.run").glob("checkpoint-*")] == ["checkpoint-000000005.safetensors"]
+
+
+def test_second_writer_is_refused(data, tmp_path):
+    from sb3_abisim.atomic import folder_lock
+
+    (tmp_path / "ssi.run").mkdir()
+    with folder_lock(tmp_path / "ssi.run"), pytest.raises(ValueError, match=str(os.getpid())):
+        run(data, tmp_path / "ssi.safetensors")
+
+
+def test_held_out_transitions_are_not_trained_on(data, tmp_path):
+    from sb3_abisim.dataset import TransitionDataset
+
+    dataset = TransitionDataset(data, holdout=0.2)
+    train, test = (set(dataset.valid_starts(1, part=part).tolist()) for part in ("train", "test"))
+    assert train and test and not train & test
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--objective", "ssi", "--env", "PointMaze-v0"], "was collected in Nav2D-v0, not in PointMaze-v0"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "n_update:3"], "n_update"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "objective_kwargs.gamma:3"], "gamma"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "n_updates"], "name:value"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "batch_size:0"], "batch_size"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "batch_size:5000"], "batch_size"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "--base", "x"], "base encoder belongs to 'abisim'"),
+        (["--objective", "abisim", "--env", "Nav2D-v0", "--base", "missing.safetensors"], "missing.safetensors"),
+        (["--objective", "dino", "--env", "Nav2D-v0"], "dino"),
+    ],
+    ids=str,
+)
+def test_command_line_mistakes_exit_2(data, tmp_path, capsys, arguments, message):
+    with pytest.raises(SystemExit) as error:
+        main([*arguments, "--data", str(data), "-o", str(tmp_path / "out.safetensors")])
+    assert error.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.safetensors"))
+
+
+def test_missing_dataset(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["--objective", "ssi", "--env", "Nav2D-v0", "--data", str(tmp_path), "-o", "x.safetensors"])
+    assert "sb3_abisim.collect" in capsys.readouterr().err
+
+
+def test_learning_rate_schedule():
+    config = PretrainConfig(n_updates=100, learning_rate="lin_0.002")
+    assert [config.learning_rate_at(n) for n in (0, 50, 75)] == [0.002, 0.001, 0.0005]
+    assert PretrainConfig(n_updates=100, learning_rate=0.3).learning_rate_at(99) == 0.3
+    for wrong in ("cos_0.1", "lin_x", "lin_0", 0.0):
+        with pytest.raises(ValueError, match=str(wrong)):
+            PretrainConfig(learning_rate=wrong)
+
+
+def test_learning_rate_reaches_the_optimizer(data, tmp_path, monkeypatch):
+    seen = []
+    step = th.optim.Adam.step
+    monkeypatch.setattr(
+        th.optim.Adam, "step", lambda self, *args: (seen.append(self.param_groups[0]["lr"]), step(self, *args))
+    )
+    run(data, tmp_path / "ssi.safetensors", n_updates=4, learning_rate="lin_0.4")
+    assert seen == pytest.approx([0.4, 0.3, 0.2, 0.1])
+
+
+@pytest.mark.parametrize("objective", ["ssi", "abisim"])
+def test_every_yaml_entry_is_valid(objective):
+    import yaml
+
+    from sb3_abisim.resources import resource_path
+
+    entries = yaml.safe_load((resource_path("hyperparams") / "pretrain" / f"{objective}.yml").read_text())
+    for env_id in entries:
+        assert load_config(objective, env_id) == PretrainConfig.from_mapping(entries[env_id])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_config(objective, "Unknown-v0") == PretrainConfig.from_mapping(entries["default"])
+    changed = load_config(objective, "Nav2D-v0", {"objective_kwargs.tau": 0.5, "k": 3})
+    assert changed.objective_kwargs["tau"] == 0.5 and changed.k == 3
