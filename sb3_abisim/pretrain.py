@@ -210,15 +210,15 @@ class _Run:
         dataset = self.dataset
         changed = {k: v for k, v in dataclasses.asdict(self.config).items() if v != getattr(PretrainConfig(), k)}
         collect = f"python -m sb3_abisim.collect --env {dataset.env_id} -n {dataset.n_transitions} -o DATA"
-        for flag, value in (("--seed", dataset.meta["seed"]), ("--n-envs", dataset.meta["n_envs"])):
-            collect += "" if value is None else f" {flag} {value}"
+        collect += f" --seed {dataset.meta['seed']} --n-envs {dataset.meta['n_envs']}"
         if dataset.env_kwargs:
             collect += f" --env-kwargs {shlex.join(f'{k}:{v!r}' for k, v in dataset.env_kwargs.items())}"
         command = f"python -m sb3_abisim.pretrain --objective {self.settings['objective']} --env {dataset.env_id}"
         return {
             "settings": self.settings,
             "commands": [
-                collect,
+                # Data that was imported has no command that would collect it again.
+                *([collect] if dataset.meta["n_envs"] is not None else []),
                 f"{command} --seed {self.seed} --data DATA -o FILE"
                 + "".join(f" -params {shlex.quote(f'{k}:{json.dumps(v)}')}" for k, v in changed.items()),
             ],

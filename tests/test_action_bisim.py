@@ -56,7 +56,7 @@ def test_target_weights_its_two_terms():
 
 @th.no_grad()
 def test_behaviour_loss_equals_loop():
-    objective, batch = make(expectation="behaviour", distance_loss="mse", c=0.7), make_batch()
+    objective, batch = make(expectation="behaviour", distance_loss="mse", c=0.7, l1_penalty=0.2), make_batch()
     phi = objective.encoder(batch.observations)
     psi = objective.base_encoder(batch.observations)
     phi_next = objective.target_encoder(batch.next_observations)
@@ -67,7 +67,8 @@ def test_behaviour_loss_equals_loop():
                 target = 0.3 * l1(psi[i], psi[j]) + 0.7 * l1(phi_next[i], phi_next[j])
                 errors.append((l1(phi[i], phi[j]) - target) ** 2)
     assert 0 < len(errors) < 30, "the batch must hold pairs of both kinds"
-    assert float(objective.loss(batch)[0]) == pytest.approx(sum(errors) / len(errors), rel=1e-4)
+    norm = sum(l1(phi[i], th.zeros(3)) for i in range(6)) / 6
+    assert float(objective.loss(batch)[0]) == pytest.approx(sum(errors) / len(errors) + 0.2 * norm, rel=1e-4)
 
 
 @pytest.mark.parametrize("wasserstein", ["means", "gaussian"])
@@ -244,6 +245,7 @@ def test_converges_to_the_metric_of_a_chain(expectation):
     [
         ({"c": 1.0}, "c must lie"),
         ({"n_pairs": 0}, "n_pairs"),
+        ({"l1_penalty": math.nan}, "l1_penalty"),
         ({"c": -0.1}, "c must lie"),
         ({"tau": 0.0}, "tau"),
         ({"expectation": "both"}, "both"),

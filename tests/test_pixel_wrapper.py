@@ -30,12 +30,13 @@ Make = Callable[..., gym.Env]
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    gymnasium_robotics = pytest.importorskip("gymnasium_robotics")
     made: list[gym.Env] = []
 
     def build(env_id: str = "PointMaze_UMaze-v3", **kwargs: object) -> gym.Env:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            import gymnasium_robotics
+
             gym.register_envs(gymnasium_robotics)
             made.append(gym.make(env_id, **kwargs))
         return made[-1]

@@ -62,8 +62,7 @@ def as_forces(actions: np.ndarray) -> np.ndarray:
 def point_xml() -> Path:
     """gymnasium-robotics' point body; the package is found, not imported."""
     spec = importlib.util.find_spec("gymnasium_robotics")
-    if spec is None or spec.origin is None:
-        pytest.skip("gymnasium-robotics is not installed")
+    assert spec is not None and spec.origin is not None
     return Path(spec.origin).parent / "envs/assets/point/point.xml"
 
 
@@ -308,6 +307,13 @@ def test_the_goal_ends_the_episode(reward_type: str, expected: list[float]) -> N
     assert (rewards[0], terminated[0], truncated[0], infos["is_success"][0]) == (expected[1], True, False, True)
     with pytest.raises(RuntimeError, match="reset"):
         env.step(np.array([LEFT]))
+
+
+@pytest.mark.parametrize(("end", "expected"), [((1.02, 0.0), False), ((0.98, 0.0), True), ((0.8, 0.8), False)])
+def test_success_is_within_one_metre(end: tuple[float, float], expected: bool) -> None:
+    env = batch(autoreset=False)
+    place(env, (end[0] + 1.01072805, end[1]))
+    assert env.step(np.array([LEFT]))[2][0] == expected
 
 
 def test_the_picture_shows_what_the_factors_say() -> None:

@@ -166,7 +166,9 @@ class BatchEnv(gym.vector.VectorEnv):
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in ended:
             final_obs[i] = observations[i].copy()
-        final_factors = {name: np.where(_along(mask, array), array, np.zeros_like(array)) for name, array in self.factors().items()}
+        final_factors = {
+            name: np.where(_along(mask, array), array, np.zeros_like(array)) for name, array in self.factors().items()
+        }
         self._begin(ended)
         observations[ended] = self._observe(ended)
         final_info = {

@@ -29,8 +29,8 @@ FRICTION = 0.5
 MAX_VELOCITY = 5.0  # m/s per axis
 SUBSTEPS = 30
 _MASS = 1000.0 * 4 / 3 * np.pi * BALL_RADIUS**3
-# Between the ball and what it might touch, beyond MuJoCo's own contact margin of 2 mm.
-_CLEARANCE = 0.02  # m
+_MARGIN = 0.002  # m, of each geom; two of them feel each other at the sum
+_CLEARANCE = 2 * _MARGIN + 1e-4
 
 # Time steps that cannot bring a freely pushed ball to this speed need no clip: what contacts add, when they turn the
 # ball or an obstacle that it has dented pushes it out, stays below the 1 m/s left.
@@ -138,7 +138,6 @@ _N_UNCLIPPED = int(_SAFE_VELOCITY / _PUSH)
 # Of a ball pushed with full force, after 0 to SUBSTEPS time steps without the clip.
 _SPEEDS = _PUSH * (1 - _DECAY ** np.arange(SUBSTEPS + 1)) / (1 - _DECAY)
 _DISTANCES = TIMESTEP * np.cumsum(_SPEEDS)
-_N_FREE = int(np.count_nonzero(_SPEEDS < MAX_VELOCITY)) - 1  # time steps before the first clip of a free ball
 
 
 def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], int, NDArray[np.float64]]:
@@ -190,7 +189,7 @@ def point_model() -> mujoco.MjModel:
         </option>
         <default>
           <joint damping="{DAMPING}"/>
-          <geom friction="{FRICTION} .1 .1" density="1000" margin="0.002" condim="1"/>
+          <geom friction="{FRICTION} .1 .1" density="1000" margin="{_MARGIN}" condim="1"/>
         </default>
         <worldbody>{geoms}<body name="ball"><geom type="sphere" size="{BALL_RADIUS}"/>{axes}</body></worldbody>
         <actuator>{motors}</actuator></mujoco>"""
@@ -213,9 +212,8 @@ class PointMazeVectorEnv(BatchEnv):
     **Physics.** MuJoCo on the point body of gymnasium-robotics: a ball of 4.19 kg and 0.1 m radius, joint damping 1,
     friction 0.5, time step 0.01 s, velocity clipped to 5 m/s per axis before every time step. A step of the
     environment is 30 time steps. It begins from rest, so that one picture is the whole state, and a push covers about
-    1 m of free floor; ``momentum=True`` keeps the velocity instead. Time steps from rest
-    in which the ball can touch nothing are summed in closed form (:func:`free_displacement`, equal to MuJoCo's to
-    1e-12 m); MuJoCo simulates the others.
+    1 m of free floor; ``momentum=True`` keeps the velocity instead. Where nothing lies in the ball's way, the 30 time
+    steps from rest are summed in closed form (:func:`free_displacement`, equal to MuJoCo's to 1e-12 m).
 
     **Observation.** uint8 (3, 64, 64), RGB: light floor, dark walls and obstacles, a green square of 1 m at the goal,
     and the agent as a red disc of 0.3 m radius, antialiased, so that its position can be read to a fraction of a
@@ -301,36 +299,23 @@ class PointMazeVectorEnv(BatchEnv):
         return rewards, reached
 
     def _move_from_rest(self, displacements: NDArray[np.float64]) -> None:
-        """Move the balls that nothing is in the way of by ``displacements``; MuJoCo simulates the others.
-
-        A ball that meets something only in the last time steps is moved freely up to them.
-        """
+        """Move the balls that nothing is in the way of by ``displacements``; MuJoCo simulates the others."""
         targets = self._position + displacements
         touching = self._solid_between(self._position, targets)
-        if not np.count_nonzero(touching):
-            self._position[:] = targets
+        n_touching = np.count_nonzero(touching)
+        if n_touching == self.num_envs:
+            self._simulate_from_rest(None)
             return
-        halfway = self._position + self._force * _DISTANCES[_N_FREE]
-        early = self._solid_between(self._position, halfway) & touching
-        late = touching & ~early
         np.copyto(self._position, targets, where=~touching[:, None])
-        np.copyto(self._position, halfway, where=late[:, None])
-        np.multiply(self._force, _SPEEDS[_N_FREE] * late[:, None], out=self._velocity)
-        if np.count_nonzero(early):
-            self._simulate_from_rest(early)
-        if np.count_nonzero(late):
-            self._simulate(self._some(late), SUBSTEPS - _N_FREE)
+        if n_touching:
+            self._simulate_from_rest(np.flatnonzero(touching))
 
-    def _some(self, mask: NDArray[np.bool_]) -> NDArray[np.int64] | None:
-        """Indices for the physics, None for all, which is faster."""
-        return None if np.count_nonzero(mask) == self.num_envs else np.flatnonzero(mask)
-
-    def _simulate_from_rest(self, mask: NDArray[np.bool_]) -> None:
+    def _simulate_from_rest(self, indices: NDArray[np.int64] | None) -> None:
         """The time steps of one step; those that no clip can concern in as few calls as possible."""
-        indices = self._some(mask)
+        self._velocity[:] = 0.0
         self._physics.step(indices, nstep=_N_UNCLIPPED)
         remaining = SUBSTEPS - _N_UNCLIPPED
-        if np.abs(self._velocity[mask]).max() + remaining * _PUSH < _SAFE_VELOCITY:
+        if np.abs(self._velocity).max() + remaining * _PUSH < _SAFE_VELOCITY:
             self._physics.step(indices, nstep=remaining)
         else:
             self._simulate(indices, remaining)

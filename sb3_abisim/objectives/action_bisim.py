@@ -126,6 +126,9 @@ class ActionBisimulation(Objective):
     :param expectation: "uniform" or "behaviour" (module docstring)
     :param distance_loss: "l1" (the paper), "smooth_l1" (the released code) or "mse"
     :param wasserstein: "means" or "gaussian", which also counts the predicted variance (:func:`w1_gaussian`)
+    :param l1_penalty: weight of the mean L1 norm of the embedding in the loss. Distances of most pairs are sums of two
+        norms, and parts of an embedding that see only far obstacles may fluctuate at no cost; a small penalty
+        silences them
     :param n_pairs: pairs of states per update
     :param n_action_samples: continuous actions per update for "uniform"
     :param action_radius: see :func:`same_action_pairs`, for continuous "behaviour"
@@ -145,6 +148,7 @@ class ActionBisimulation(Objective):
         expectation: str = "uniform",
         distance_loss: str = "l1",
         wasserstein: str = "means",
+        l1_penalty: float = 0.0,
         n_pairs: int = 4096,
         n_action_samples: int = 8,
         action_radius: float = 0.2,
@@ -154,6 +158,8 @@ class ActionBisimulation(Objective):
         super().__init__(encoder, action_space)
         if not 0 <= c < 1:
             raise ValueError(f"c must lie in [0, 1), got {c}: the recursion has no fixed point otherwise")
+        if not 0 <= l1_penalty < math.inf:
+            raise ValueError(f"l1_penalty must be a number of at least 0, got {l1_penalty}")
         if not 0 < tau <= 1:
             raise ValueError(f"tau must lie in (0, 1], got {tau}")
         for value, known in ((expectation, EXPECTATIONS), (distance_loss, LOSSES), (wasserstein, WASSERSTEIN)):
@@ -163,7 +169,7 @@ class ActionBisimulation(Objective):
             raise ValueError("wasserstein='gaussian' needs the forward model of expectation='uniform'")
         if forward_reset_interval is not None and forward_reset_interval < 1:
             raise ValueError(f"forward_reset_interval must be at least 1 or None, got {forward_reset_interval}")
-        self.c, self.tau = c, tau
+        self.c, self.tau, self.l1_penalty = c, tau, l1_penalty
         self.expectation, self.distance_loss, self.wasserstein = expectation, distance_loss, wasserstein
         for name, count in (("n_pairs", n_pairs), ("n_action_samples", n_action_samples)):
             if count < 1:
@@ -203,8 +209,9 @@ class ActionBisimulation(Objective):
         target = action_bisim_target(l1_distance(psi[i], psi[j]), next_distance, self.c)
         distance = l1_distance(phi[i], phi[j])
         metric_loss = LOSSES[self.distance_loss](distance, target)
-        terms |= {"metric": metric_loss, "distance": distance.mean(), "target": target.mean()}
-        return metric_loss + forward_loss, {name: term.detach() for name, term in terms.items()}
+        l1_norm = phi.abs().sum(dim=1).mean()
+        terms |= {"metric": metric_loss, "distance": distance.mean(), "target": target.mean(), "l1_norm": l1_norm}
+        return metric_loss + self.l1_penalty * l1_norm + forward_loss, {name: term.detach() for name, term in terms.items()}
 
     def _sample_pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Indices of ``n_pairs`` different pairs of transitions (all, if there are fewer), each (n_pairs,)."""

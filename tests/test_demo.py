@@ -1,0 +1,33 @@
+"""The demo runs end to end and leaves what it promises."""
+
+import pytest
+from PIL import Image
+
+from sb3_abisim.demo import GIF_EPISODES, main, newest_run
+
+
+def test_demo_leaves_a_curve_a_gif_and_a_run(tmp_path, capfd):
+    main(["-o", str(tmp_path), "--n-transitions", "600", "--n-updates", "5", "--n-timesteps", "2048"])
+    out = capfd.readouterr().out
+    for name in ("data/meta.json", "ssi.safetensors", "abisim.safetensors", "learning_curve.png", "agent.gif"):
+        assert (tmp_path / name).is_file(), name
+    assert str(tmp_path) in out and "learning curve" in out
+    assert "source " + str(tmp_path / "abisim.safetensors") in out, "PPO must train on the encoder that was just made"
+    run = newest_run(tmp_path)
+    assert (run / "DistractorPointMaze-v0.zip").is_file()
+    with Image.open(tmp_path / "agent.gif") as gif:
+        # Each episode has at least one picture and its last one stays for a second.
+        assert gif.n_frames > 2 * GIF_EPISODES
+        assert gif.size == (256, 256)
+    with Image.open(tmp_path / "learning_curve.png") as picture:
+        assert len(picture.convert("RGB").getcolors(1 << 24)) > 10, "the curve must be visible"
+
+
+def test_a_failing_command_stops_the_demo(tmp_path):
+    import subprocess
+
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "something_else.txt").write_text("mine")
+    with pytest.raises(subprocess.CalledProcessError):
+        main(["-o", str(tmp_path), "--n-transitions", "600"])
+    assert (tmp_path / "data" / "something_else.txt").read_text() == "mine"
