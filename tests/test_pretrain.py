@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -40,11 +41,21 @@ def test_writes_encoder_card_and_log(data, tmp_path):
     assert card["curves"]["n_updates"] == [5, 10, 15, 20, 25, 30]
     assert card["metrics"]["test/accuracy"] == card["curves"]["test/accuracy"][-1]
     assert card["settings"]["batch_size"] == 32
-    assert "--seed 0" in card["commands"][1]
     log = output.with_suffix(".run") / "progress.csv"
     assert len(log.read_text().splitlines()) == 7
     assert not list(output.with_suffix(".run").glob("checkpoint*")), "checkpoints go when the run is over"
     assert list(output.with_suffix(".run").glob("events.out.tfevents*"))
+
+
+def test_the_commands_on_the_card_make_the_same_encoder(data, tmp_path, capsys):
+    output = run(data, tmp_path / "ssi.safetensors")
+    card = json.loads(output.with_suffix(".json").read_text())
+    places = {"DATA": str(tmp_path / "data"), "FILE": str(tmp_path / "again.safetensors")}
+    for command, main_function in zip(card["commands"], (collect, main), strict=True):
+        words = [places.get(word, word) for word in shlex.split(command)]
+        assert words[:2] == ["python", "-m"]
+        main_function([*words[3:], *(["--device", "cpu"] if main_function is main else [])])
+    assert (tmp_path / "again.safetensors").read_bytes() == output.read_bytes()
 
 
 def test_abisim_trains_its_base_first(data, tmp_path, monkeypatch):
@@ -72,9 +83,9 @@ def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, 
     # Different folders, equal names: what is compared must not hold the path.
     outputs = [tmp_path / name / "encoder.safetensors" for name in ("whole", "stopped")]
     pretrain(objective, data, outputs[0], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
-    from sb3_abisim.pretrain import _Run
+    from sb3_abisim.pretrain_run import PretrainRun
 
-    update, count = _Run._update, 0
+    update, count = PretrainRun._update, 0
 
     def interrupt(self, batch):
         nonlocal count
@@ -83,7 +94,7 @@ def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, 
             raise Interrupted
         return update(self, batch)
 
-    monkeypatch.setattr(_Run, "_update", interrupt)
+    monkeypatch.setattr(PretrainRun, "_update", interrupt)
     with pytest.raises(Interrupted):
         pretrain(objective, data, outputs[1], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
     assert not outputs[1].exists()
@@ -143,18 +154,18 @@ def test_finished_run_is_left_alone_and_other_settings_are_refused(data, tmp_pat
 
 
 def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretrain import _Run
+    from sb3_abisim.pretrain_run import PretrainRun
 
-    monkeypatch.setattr(_Run, "finish", lambda self: None)
+    monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
     with pytest.raises(ValueError, match="other settings"):
         run(data, tmp_path / "ssi.safetensors", learning_rate=0.5)
 
 
 def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretrain import _Run
+    from sb3_abisim.pretrain_run import PretrainRun
 
-    monkeypatch.setattr(_Run, "finish", lambda self: None)
+    monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
     path = sorted((tmp_path / "ssi.run").glob("checkpoint-*"))[-1]
     content = bytearray(path.read_bytes())
@@ -167,9 +178,9 @@ def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
 
 
 def test_keeps_the_last_two_checkpoints(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretrain import _Run
+    from sb3_abisim.pretrain_run import PretrainRun
 
-    monkeypatch.setattr(_Run, "finish", lambda self: None)
+    monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
     names = [path.name for path in sorted((tmp_path / "ssi.run").glob("checkpoint-*"))]
     assert names == ["checkpoint-000000025.safetensors", "checkpoint-000000030.safetensors"]

@@ -8,7 +8,8 @@ HEAD = """# Shipped encoders
 
 Pretrained with the settings of `hyperparams/pretrain/` on uniformly random actions, seed 0, one thread. The card beside
 each file (`.json`) holds the commands that made it, the digest of its data, all curves and the settings. This table is
-made of the cards by `tools/make_encoder_table.py`; its numbers are those of the last row of the log, on held-out episodes.
+made of the cards by `tools/make_encoder_table.py`; its numbers are those of the last row of the log, on held-out
+episodes.
 
 `accuracy`: share of actions told from two consecutive pictures (for continuous actions, the coefficient of
 determination). A blocked move looks like any other blocked move, so 1 cannot be reached. `metric` and `distance`: the
@@ -30,7 +31,8 @@ def main() -> None:
         size = path.with_suffix(".safetensors").stat().st_size / 1000
         rows.append(
             f"| `{path.parent.name}/{path.stem}` | {card['dataset']['n_transitions']:,} | "
-            f"{card['settings']['n_updates']:,} | {card['n_parameters']:,} | {card['features_dim']} | {size:.0f} | {result} |"
+            f"{card['settings']['n_updates']:,} | {card['n_parameters']:,} | {card['features_dim']} | {size:.0f} | "
+            f"{result} |"
         )
     (ENCODERS / "README.md").write_text(HEAD + "\n".join(rows) + "\n")
 

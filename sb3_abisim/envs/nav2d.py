@@ -41,6 +41,7 @@ LAYOUTS = {
 _COLOURS = {"floor": (240, 240, 235), "obstacles": (60, 64, 72), "goal": (46, 160, 67), "agent": (214, 40, 40)}
 _CELL_PIXELS = 32
 
+_N_CELLS = SIZE * SIZE
 _GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
 # Bitboards: cell (x, y) is bit y * _STRIDE + x. The sixteenth column is never free, so shifts cannot wrap around.
 _STRIDE = SIZE + 1
@@ -71,6 +72,18 @@ def _connected(start: int, goal: int, free: int) -> bool:
             return False
         reached = grown
     return True
+
+
+def _neighbours() -> NDArray[np.int64]:
+    """The cell that each move leads to on an empty grid, shape (SIZE * SIZE, 4)."""
+    y, x = np.divmod(np.arange(_N_CELLS)[:, None], SIZE)
+    dx, dy = np.array(MOVES).T
+    # Clipping leaves a move off the grid in place, because a move changes one coordinate only.
+    cells: NDArray[np.int64] = np.clip(y + dy, 0, SIZE - 1) * SIZE + np.clip(x + dx, 0, SIZE - 1)
+    return cells
+
+
+_NEIGHBOURS = _neighbours()
 
 
 class Nav2DVectorEnv(BatchEnv):
@@ -118,11 +131,12 @@ class Nav2DVectorEnv(BatchEnv):
         # Pictures are kept up to date move by move; channel order as in CHANNELS, cells flattened.
         self._pictures = np.zeros((num_envs, len(CHANNELS), SIZE * SIZE), dtype=np.uint8)
         self._pictures[:, 2, _GOAL_CELL] = 255
-        # Cells with a border of blocked ones, so that a move needs one lookup.
-        self._blocked = np.ones((num_envs, SIZE + 2, SIZE + 2), dtype=bool)
-        self._agents = np.zeros((num_envs, 2), dtype=np.int64)
-        self._moves = np.array(MOVES)
-        self._copies = np.arange(num_envs)
+        # Agents are kept as indices into the flattened pictures, and so is where each move leads from each index, so
+        # that a step is one lookup.
+        self._first = np.arange(num_envs) * len(CHANNELS) * _N_CELLS
+        self._agents = self._first.copy()
+        self._goals = self._first + _GOAL_CELL
+        self._targets = np.zeros((num_envs, len(CHANNELS) * _N_CELLS, len(MOVES)), dtype=np.int64)
         if layout != "random":
             cells = np.array([list(row) for row in LAYOUTS[layout]]).ravel()
             self._walls, self._scenery = cells == "#", cells == "?"
@@ -133,11 +147,12 @@ class Nav2DVectorEnv(BatchEnv):
         draw = self._draw_random if self.layout == "random" else self._draw_fixed
         for i in indices:
             cell, obstacles = draw(self._generators[i])
-            self._agents[i] = cell % SIZE, cell // SIZE
+            self._agents[i] = self._first[i] + cell
             self._pictures[i, 0] = 0
             self._pictures[i, 0, cell] = 255
             self._pictures[i, 1] = np.where(obstacles, 255, 0)
-            self._blocked[i, 1:-1, 1:-1] = obstacles.reshape(SIZE, SIZE)
+            stay = np.arange(_N_CELLS)[:, None]
+            self._targets[i, :_N_CELLS] = self._first[i] + np.where(obstacles[_NEIGHBOURS], stay, _NEIGHBOURS)
 
     def _draw_random(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
         """An agent's cell and obstacles (SIZE * SIZE,) with a path to the goal."""
@@ -162,15 +177,12 @@ class Nav2DVectorEnv(BatchEnv):
         return cell, self._walls | (scenery & self._scenery)
 
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        x, y = self._agents.T
-        self._pictures[self._copies, 0, y * SIZE + x] = 0
-        targets = self._agents + self._moves[actions]
-        free = ~self._blocked[self._copies, targets[:, 1] + 1, targets[:, 0] + 1]
-        self._agents[free] = targets[free]
-        cells = self._agents[:, 1] * SIZE + self._agents[:, 0]
-        self._pictures[self._copies, 0, cells] = 255
-        reached = cells == _GOAL_CELL
-        return np.where(reached, 0.0, -1.0), reached
+        pixels = self._pictures.reshape(-1)
+        pixels[self._agents] = 0
+        self._agents = self._targets.reshape(-1)[self._agents * len(MOVES) + actions]
+        pixels[self._agents] = 255
+        reached = self._agents == self._goals
+        return reached - 1.0, reached
 
     def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
         # Indexing with an array copies, so callers may keep what they get.
@@ -178,7 +190,9 @@ class Nav2DVectorEnv(BatchEnv):
 
     def factors(self) -> dict[str, NDArray[Any]]:
         """Agent (x, y), int64 (num_envs, 2); obstacles by [y, x], bool (num_envs, 15, 15)."""
-        return {"agent": self._agents.copy(), "obstacles": self._blocked[:, 1:-1, 1:-1].copy()}
+        y, x = np.divmod(self._agents - self._first, SIZE)
+        obstacles = self._pictures[:, 1].reshape(-1, SIZE, SIZE) > 0
+        return {"agent": np.stack([x, y], axis=1), "obstacles": obstacles}
 
     def _render_frame(self, index: int) -> NDArray[np.uint8]:
         agent, obstacles, goal = self._pictures[index].reshape(-1, SIZE, SIZE) > 0

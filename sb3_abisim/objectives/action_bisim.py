@@ -211,7 +211,8 @@ class ActionBisimulation(Objective):
         metric_loss = LOSSES[self.distance_loss](distance, target)
         l1_norm = phi.abs().sum(dim=1).mean()
         terms |= {"metric": metric_loss, "distance": distance.mean(), "target": target.mean(), "l1_norm": l1_norm}
-        return metric_loss + self.l1_penalty * l1_norm + forward_loss, {name: term.detach() for name, term in terms.items()}
+        loss = metric_loss + self.l1_penalty * l1_norm + forward_loss
+        return loss, {name: term.detach() for name, term in terms.items()}
 
     def _sample_pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Indices of ``n_pairs`` different pairs of transitions (all, if there are fewer), each (n_pairs,)."""
