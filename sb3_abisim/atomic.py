@@ -49,7 +49,10 @@ def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], ob
 
 
 def fsync_folder(path: str | os.PathLike[str]) -> None:
-    """Make the names in a folder (files created, renamed or removed) durable."""
+    """Make the names in a folder (files created, renamed or removed) durable.
+
+    :param path: the folder
+    """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -58,12 +61,18 @@ def fsync_folder(path: str | os.PathLike[str]) -> None:
 
 
 def is_temporary(name: str) -> bool:
-    """Whether a file name is one that :func:`write_atomic` uses before the rename."""
+    """Whether a file name is one that :func:`write_atomic` uses before the rename.
+
+    :param name: a file name without its folder
+    """
     return name.startswith(".") and name.endswith(_TEMPORARY_SUFFIX)
 
 
 def remove_temporaries(folder: str | os.PathLike[str]) -> None:
-    """Remove what killed calls of :func:`write_atomic` left in a folder; call it only while holding its lock."""
+    """Remove what killed calls of :func:`write_atomic` left in a folder; call it only while holding its lock.
+
+    :param folder: an existing folder
+    """
     for path in Path(folder).iterdir():
         if is_temporary(path.name):
             path.unlink()
@@ -114,6 +123,9 @@ def _is_same_file(descriptor: int, path: Path) -> bool:
 
 
 def file_digest(path: str | os.PathLike[str]) -> str:
-    """The sha256 of a file's content in hexadecimal."""
+    """The sha256 of a file's content in hexadecimal.
+
+    :param path: the file
+    """
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

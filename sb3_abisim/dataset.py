@@ -131,11 +131,17 @@ class TransitionDataset:
         return self._gather("frames", self._check_index(index))
 
     def actions(self, index: Any) -> NDArray[Any]:
-        """Actions taken at the given frames, int64 [m] or float32 [m, A]; zero at a segment's last frame."""
+        """Actions taken at the given frames, int64 [m] or float32 [m, A]; zero at a segment's last frame.
+
+        :param index: integers [m] in 0..n_frames - 1
+        """
         return self._actions[self._check_index(index)]
 
     def factors(self, index: Any) -> dict[str, NDArray[Any]]:
-        """The simulator's state behind the given frames: name to [m, ...]; for probes, never for a loss."""
+        """The simulator's state behind the given frames: name to [m, ...]; for probes, never for a loss.
+
+        :param index: integers [m] in 0..n_frames - 1
+        """
         index = self._check_index(index)
         return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
 

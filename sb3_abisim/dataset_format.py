@@ -52,27 +52,45 @@ class DatasetError(ValueError):
 
 
 def array_names(identity: dict[str, Any]) -> tuple[str, ...]:
-    """The arrays of every shard, in the order of writing."""
+    """The arrays of every shard, in the order of writing.
+
+    :param identity: a document with the keys ``IDENTITY_KEYS``, such as config.json or meta.json
+    """
     return "frames", "actions", "ends", *(f"factor_{name}" for name in identity["factors"])
 
 
 def array_file(name: str, shard: int) -> str:
-    """The file name of one array of a shard."""
+    """The file name of one array of a shard.
+
+    :param name: one of :func:`array_names`
+    :param shard: its number, from 0
+    """
     return f"{name}-{shard:05d}.npy"
 
 
 def shard_file(shard: int) -> str:
-    """The file name of a shard's manifest."""
+    """The file name of a shard's manifest.
+
+    :param shard: its number, from 0
+    """
     return f"shard-{shard:05d}.json"
 
 
 def is_shard_file(name: str) -> bool:
-    """Whether a file name is one that this format gives to an array or a shard's manifest."""
+    """Whether a file name is one that this format gives to an array or a shard's manifest.
+
+    :param name: a file name without its folder
+    """
     return _SHARD_FILE.fullmatch(name) is not None
 
 
 def is_shard_manifest(document: Any, shard: int, identity: dict[str, Any]) -> bool:
-    """Whether a JSON value has the form of a shard's manifest and lists exactly the shard's files."""
+    """Whether a JSON value has the form of a shard's manifest and lists exactly the shard's files.
+
+    :param document: what was read
+    :param shard: its number, from 0
+    :param identity: as for :func:`array_names`
+    """
     if not isinstance(document, dict) or set(document) != {"n_transitions", "n_frames", "files"}:
         return False
     files = document["files"]
@@ -82,7 +100,11 @@ def is_shard_manifest(document: Any, shard: int, identity: dict[str, Any]) -> bo
 
 
 def array_layout(identity: dict[str, Any], name: str) -> tuple[np.dtype[Any], tuple[int, ...]]:
-    """The dtype of an array of the dataset and the shape of one of its rows."""
+    """The dtype of an array of the dataset and the shape of one of its rows.
+
+    :param identity: as for :func:`array_names`
+    :param name: one of :func:`array_names`
+    """
     if name == "frames":
         return np.dtype(np.uint8), tuple(identity["observation_space"]["shape"])
     if name == "ends":
@@ -110,6 +132,7 @@ def describe_factors(factors: dict[str, NDArray[Any]]) -> dict[str, Any]:
 def check_factor_layout(layout: Any) -> None:
     """Refuse factors whose names cannot be part of a file name, or that hold no numbers.
 
+    :param layout: what :func:`describe_factors` returned, or was read from a file
     :raises ValueError: with the name or dtype
     """
     for name, row in layout.items():
@@ -122,6 +145,8 @@ def check_factor_layout(layout: Any) -> None:
 def check_spaces(observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
     """Refuse spaces that a dataset cannot hold.
 
+    :param observation_space: of one environment
+    :param action_space: of one environment
     :raises ValueError: unless observations are uint8 images, channels first, in 0..255, and actions are ``Discrete`` or
         a bounded float32 ``Box``
     """
@@ -146,12 +171,18 @@ def check_spaces(observation_space: gym.Space[Any], action_space: gym.Space[Any]
 
 
 def is_channels_first(shape: tuple[int, ...]) -> bool:
-    """Stable-Baselines3's rule: the smallest dimension of an image is its channels."""
+    """Stable-Baselines3's rule: the smallest dimension of an image is its channels.
+
+    :param shape: of an image space, three dimensions
+    """
     return int(np.argmin(shape)) == 0
 
 
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
-    """A ``Discrete`` or ``Box`` space as JSON types; bounds that are the same everywhere become one number."""
+    """A ``Discrete`` or ``Box`` space as JSON types; bounds that are the same everywhere become one number.
+
+    :param space: ``Discrete`` or ``Box``
+    """
     if isinstance(space, spaces.Discrete):
         return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
     if not isinstance(space, spaces.Box):
@@ -161,7 +192,10 @@ def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
 
 
 def space_from_json(document: dict[str, Any]) -> spaces.Discrete | spaces.Box:
-    """The inverse of :func:`space_to_json`."""
+    """The inverse of :func:`space_to_json`.
+
+    :param document: what :func:`space_to_json` returned
+    """
     if document["type"] == "Discrete":
         return spaces.Discrete(int(document["n"]), start=int(document["start"]))
     if document["type"] != "Box":
@@ -174,13 +208,17 @@ def space_from_json(document: dict[str, Any]) -> spaces.Discrete | spaces.Box:
 
 
 def to_json_bytes(document: dict[str, Any]) -> bytes:
-    """Readable JSON that is the same for equal documents."""
+    """Readable JSON that is the same for equal documents.
+
+    :param document: JSON types, numbers finite
+    """
     return (json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
 def from_json_file(path: Path) -> dict[str, Any]:
     """A JSON object from a file.
 
+    :param path: the file
     :raises DatasetError: if the file is damaged
     """
     try:
@@ -215,6 +253,7 @@ def make_meta(config: dict[str, Any], shards: list[dict[str, Any]]) -> dict[str,
 def check_meta(meta: dict[str, Any]) -> None:
     """Refuse a meta.json that is damaged or of another format.
 
+    :param meta: the content of meta.json
     :raises ValueError: with the reason
     """
     if meta.get("format_version") != FORMAT_VERSION:

@@ -61,6 +61,7 @@ def package_versions() -> dict[str, str]:
 def check_folder(folder: Path) -> None:
     """Refuse to write a dataset into something else.
 
+    :param folder: new, or what the user named
     :raises ValueError: if ``folder`` is a file, or holds files and is not a dataset folder
     """
     if folder.exists() and not folder.is_dir():
@@ -127,7 +128,11 @@ class DatasetWriter:
         return total
 
     def has_shard(self, shard: int, n_transitions: int) -> bool:
-        """Whether a shard is there, undamaged (by sizes and hashes), with that many transitions."""
+        """Whether a shard is there, undamaged (by sizes and hashes), with that many transitions.
+
+        :param shard: its number, from 0
+        :param n_transitions: how many it must hold
+        """
         manifest = self._manifest(shard)
         return manifest is not None and manifest["n_transitions"] == n_transitions and self._is_intact(manifest)
 
@@ -164,6 +169,7 @@ class DatasetWriter:
     def finish(self, n_shards: int) -> str:
         """Write meta.json over shards 0 to ``n_shards - 1``.
 
+        :param n_shards: how many there are, at least 1
         :return: the dataset's digest
         """
         shards = [from_json_file(self.folder / shard_file(k)) for k in range(n_shards)]

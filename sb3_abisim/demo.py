@@ -5,6 +5,7 @@ trained agent and the folder where everything lies. The budget is far below the 
 """
 
 import argparse
+import importlib.util
 import shlex
 import subprocess
 import sys
@@ -40,7 +41,10 @@ def commands(folder: Path, n_transitions: int, n_updates: int, n_timesteps: int)
 
 
 def newest_run(folder: Path) -> Path:
-    """The zoo's run folder that was written last below ``folder``."""
+    """The zoo's run folder that was written last.
+
+    :param folder: the demo's folder
+    """
     return max((folder / "logs" / "ppo").glob(f"{ENV_ID}_*"), key=lambda run: run.stat().st_mtime)
 
 
@@ -100,13 +104,20 @@ def record_gif(run: Path, path: Path) -> float:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """The command; see ``--help``."""
+    """The command; see ``--help``.
+
+    :param argv: arguments, None for those of the process
+    """
     parser = argparse.ArgumentParser("python -m sb3_abisim.demo", description=__doc__.split("\n\n")[0])
     parser.add_argument("-o", "--output", default="demo", metavar="DIR", help="folder for everything (default: demo)")
     parser.add_argument("--n-transitions", type=int, default=50_000)
     parser.add_argument("--n-updates", type=int, default=1_500)
     parser.add_argument("--n-timesteps", type=int, default=300_000)
     args = parser.parse_args(argv)
+    # Now, not after ten minutes.
+    missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
+    if missing:
+        parser.error(f"{' and '.join(missing)} not installed; run: pip install 'sb3_abisim[plots]'")
     folder, start = Path(args.output), time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     for words in commands(folder, args.n_transitions, args.n_updates, args.n_timesteps):

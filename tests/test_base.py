@@ -93,6 +93,15 @@ def test_refuses_bad_discrete_actions(env_id, action):
         env.step(action)
 
 
+@pytest.mark.parametrize("env_id", DISCRETE)
+@pytest.mark.parametrize("dtype", np.typecodes["AllInteger"])
+def test_takes_integers_of_any_type(env_id, dtype):
+    one, other = (make_batch(env_id, 3) for _ in range(2))
+    one.reset(seed=0), other.reset(seed=0)
+    actions = np.array([3, 1, 0])
+    assert np.array_equal(one.step(actions.astype(dtype))[0], other.step(actions)[0])
+
+
 @pytest.mark.parametrize("env_id", CONTINUOUS)
 @pytest.mark.parametrize("action", [[0.0, 1.1], [np.nan, 0.0], [np.inf, 0.0], [0.5], 0.5, ["a", "b"]], ids=str)
 def test_refuses_bad_continuous_actions(env_id, action):

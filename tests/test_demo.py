@@ -1,5 +1,7 @@
 """The demo runs end to end and leaves what it promises."""
 
+import importlib.util
+
 import pytest
 from PIL import Image
 
@@ -21,6 +23,15 @@ def test_demo_leaves_a_curve_a_gif_and_a_run(tmp_path, capfd):
         assert gif.size == (256, 256)
     with Image.open(tmp_path / "learning_curve.png") as picture:
         assert len(picture.convert("RGB").getcolors(1 << 24)) > 10, "the curve must be visible"
+
+
+def test_what_is_missing_is_said_before_the_work(tmp_path, capsys, monkeypatch):
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "PIL" else find_spec(name))
+    with pytest.raises(SystemExit) as stopped:
+        main(["-o", str(tmp_path / "demo")])
+    assert stopped.value.code == 2 and "pip install 'sb3_abisim[plots]'" in capsys.readouterr().err
+    assert not (tmp_path / "demo").exists()
 
 
 def test_a_failing_command_stops_the_demo(tmp_path):

@@ -2,6 +2,10 @@
 
 import gymnasium as gym
 
+from sb3_abisim.envs.pixel_wrapper import PointMazePixels
+
+__all__ = ["ENV_IDS", "PointMazePixels"]
+
 # id: (module, class name without the ending Env/VectorEnv, default keyword arguments, steps per episode)
 _TABLE: dict[str, tuple[str, str, dict[str, object], int]] = {
     "Nav2D-v0": ("nav2d", "Nav2D", {}, 50),

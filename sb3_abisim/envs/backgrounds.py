@@ -89,6 +89,7 @@ class Backgrounds:
     def select(self, names: Iterable[str]) -> "Backgrounds":
         """The clips with these names, in the order given.
 
+        :param names: of clips, distinct, at least one
         :raises ValueError: for a name that is not among this split's clips, a repeated name, or none at all
         """
         chosen = list(names)
@@ -159,7 +160,11 @@ class BackgroundPlayer:
             self._shuffles = [np.zeros(1, dtype=np.int64)] * n_envs
 
     def start(self, index: int, generator: np.random.Generator) -> None:
-        """Begin a new episode of environment ``index``."""
+        """Begin a new episode of environment ``index``.
+
+        :param index: of the environment
+        :param generator: three numbers are drawn from it
+        """
         clip_draw, start_draw, order_draw = generator.random(N_DRAWS).tolist()
         clip = int(clip_draw * self.backgrounds.n_clips)
         length = int(self.backgrounds.lengths[clip])
@@ -182,7 +187,10 @@ class BackgroundPlayer:
         return frame
 
     def pictures(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """What is now shown behind the environments ``indices``: a new array, uint8 (len(indices), 3, 64, 64)."""
+        """What is now shown behind the environments ``indices``: a new array, uint8 (len(indices), 3, 64, 64).
+
+        :param indices: of environments, shape (m,)
+        """
         # Positions that are not shuffled need no folding here, `frames` does it.
         frame = self._position if self._shuffles is None else self.frame
         return self.backgrounds.frames(self.clip[indices], frame[indices])
@@ -261,7 +269,10 @@ def split_groups(groups: Iterable[str], seed: int, eval_fraction: float) -> tupl
 
 
 def digest_of(frames: NDArray[np.uint8]) -> str:
-    """sha256 of an array's bytes, in hexadecimal."""
+    """sha256 of an array's bytes, in hexadecimal.
+
+    :param frames: of any shape and dtype
+    """
     return hashlib.sha256(np.ascontiguousarray(frames).data).hexdigest()
 
 

@@ -192,7 +192,8 @@ class BatchEnv(gym.vector.VectorEnv):
         if np.count_nonzero(inside) < inside.size:
             bad = array[~inside.reshape(self.num_envs, -1).all(axis=1)][0]
             raise ValueError(f"action {bad!r} is outside {self.single_action_space}; clip or rescale it before step()")
-        return array
+        # NumPy makes floats of int64 and uint64 together, and those are no indices.
+        return array.astype(np.int64) if array.dtype.kind == "u" else array
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture of every copy, each (height, width, 3) uint8 RGB; None without ``render_mode``."""
@@ -223,7 +224,11 @@ class SingleEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """Start a new episode; ``seed`` determines it and all that follow."""
+        """Start a new episode; ``seed`` determines it and all that follow.
+
+        :param seed: None goes on with the present generator
+        :param options: none are known
+        """
         super().reset(seed=seed)
         observations, _ = self.batch.reset(seed=seed, options=options)
         # One generator: a wrapper that draws from `env.np_random` advances the same stream as the environment.
@@ -233,6 +238,7 @@ class SingleEnv(gym.Env):
     def step(self, action: Any) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
         """Take one action.
 
+        :param action: an element of the action space
         :raises ValueError: for an action of the wrong shape, out of range, or not finite
         """
         observations, rewards, terminated, truncated, infos = self.batch.step(np.asarray(action)[None])

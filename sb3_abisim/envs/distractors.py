@@ -108,11 +108,9 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
 
 
 class DistractorPointMazeEnv(SingleEnv):
+    """One :class:`DistractorPointMazeVectorEnv`, as a ``gymnasium.Env``; the specification stands there."""
+
     batch_class = DistractorPointMazeVectorEnv
-    __doc__ = (DistractorPointMazeVectorEnv.__doc__ or "").replace(
-        "``num_envs`` point mazes whose floor shows a clip of moving pictures.",
-        "A point maze whose floor shows a clip of moving pictures.",
-    )
 
     @property
     def fingerprint(self) -> str:

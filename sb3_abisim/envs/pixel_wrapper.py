@@ -129,6 +129,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
     def step(self, action: Any) -> tuple[NDArray[np.uint8], SupportsFloat, bool, bool, dict[str, Any]]:
         """Take one action.
 
+        :param action: an element of the action space
         :raises ValueError: for an action of the wrong shape, out of range, or not finite
         """
         force = self._force(action)

@@ -49,12 +49,18 @@ _CORNER_SIGNS = np.array((1, -1, -1, 1))
 
 
 def to_pixels(positions: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Positions (x, y) in metres, shape (..., 2), as (column, row) in pixels."""
+    """Positions (x, y) in metres, shape (..., 2), as (column, row) in pixels.
+
+    :param positions: in metres from the middle of the picture, y down
+    """
     return positions * np.float64(PIXELS_PER_METRE) + _CENTRE
 
 
 def to_metres(pixels: NDArray[Any]) -> NDArray[np.float64]:
-    """(column, row) in pixels, shape (..., 2), as positions (x, y) in metres."""
+    """(column, row) in pixels, shape (..., 2), as positions (x, y) in metres.
+
+    :param pixels: real numbers, shape (..., 2)
+    """
     return (pixels - _CENTRE) / PIXELS_PER_METRE
 
 
@@ -143,6 +149,7 @@ _DISTANCES = TIMESTEP * np.cumsum(_SPEEDS)
 def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], int, NDArray[np.float64]]:
     """Draw the obstacles and the start of an episode, until a corridor 0.5 m wide joins start and goal.
 
+    :param generator: the environment's own
     :return: (column, row) of the obstacles' top left pixels, shape (20, 2); the bitboard of obstacles and walls; the
         start (x, y) in metres
     """
@@ -355,16 +362,6 @@ class PointMazeVectorEnv(BatchEnv):
         self._lay_over(backgrounds, indices)
         self._agent.draw(backgrounds, to_pixels(self._position[indices]), over=self._layers[indices])
         return backgrounds
-
-    def _foreground(self, indices: NDArray[np.int64]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """The observations, and which of their pixels show something other than floor.
-
-        :return: pictures (n, 3, 64, 64); masks (n, 64, 64), true where the agent (at any coverage), an obstacle, a
-            wall or the goal is seen. Both are new arrays.
-        """
-        masks = self._floor[indices, 0] == 0
-        self._agent.mark(masks, to_pixels(self._position[indices]))
-        return self._observe(indices), masks
 
     def _lay_over(self, backgrounds: NDArray[np.uint8], indices: NDArray[np.int64]) -> None:
         """Replace the floor of the static layers by pictures, in place: shape (len(indices), 3, 64, 64)."""

@@ -135,12 +135,20 @@ class DiscPainter:
 
 
 def floor(size: int) -> NDArray[np.uint8]:
-    """A picture of nothing but floor, shape (3, size, size)."""
+    """A picture of nothing but floor, shape (3, size, size).
+
+    :param size: height and width, in pixels
+    """
     return np.tile(np.array(FLOOR, dtype=np.uint8)[:, None, None], (1, size, size))
 
 
 def paint(picture: NDArray[np.uint8], where: NDArray[np.bool_], colour: tuple[int, int, int]) -> None:
-    """Fill the pixels ``where`` (height, width) of one picture (3, height, width) with a colour, in place."""
+    """Fill the pixels ``where`` (height, width) of one picture (3, height, width) with a colour, in place.
+
+    :param picture: uint8, contiguous or not
+    :param where: bool
+    :param colour: RGB, 0..255
+    """
     for channel, value in zip(picture, colour, strict=True):
         channel[where] = value
 

@@ -44,6 +44,7 @@ class ClipError(ValueError):
 def decode_video(path: Path) -> Iterator["Image.Image"]:
     """The frames of a video file.
 
+    :param path: the file
     :raises ClipError: if it cannot be decoded or has fewer frames than its header promises
     :raises ImportError: if the decoder is not installed
     """
@@ -112,7 +113,10 @@ def _check_numbers(source: Source) -> None:
 
 
 def shrink(image: "Image.Image") -> NDArray[np.uint8]:
-    """The central square of a picture, averaged to uint8 (3, 64, 64)."""
+    """The central square of a picture, averaged to uint8 (3, 64, 64).
+
+    :param image: of any size and mode
+    """
     box = _import_decoder("PIL.Image").Resampling.BOX
     side = min(image.size)
     left, top = (image.width - side) // 2, (image.height - side) // 2
@@ -244,6 +248,9 @@ def load_split(
     :param split: which side to load
     :param train: sources of the train side
     :param unseen: sources of the eval side
+    :param min_frames: shortest clip accepted
+    :param max_bytes: most memory the decoded frames may take
+    :param on_error: "raise", or "skip" for a warning that lists what was left out
     :raises ClipError: for a clip that cannot be decoded, lacks frames or is shorter than ``min_frames``
     :raises ValueError: for a file on both sides, more than ``max_bytes`` of frames, or if every clip was skipped
     """

@@ -46,7 +46,10 @@ class Source:
 
 
 def natural_key(name: str) -> list[Any]:
-    """Sorts frame2 before frame10, whatever the case of letters."""
+    """Sorts frame2 before frame10, whatever the case of letters.
+
+    :param name: a file name or path
+    """
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split("([0-9]+)", name))]
 
 
@@ -56,6 +59,7 @@ def find_sources(root: Path) -> tuple[Source, ...]:
     ``root/train`` and ``root/eval``, where both exist, are taken as the split. Hidden files are left out, and so are
     pictures beside video files (their thumbnails).
 
+    :param root: the folder
     :raises ValueError: for a folder that is missing, not a folder, or without videos
     """
     if not root.exists():
@@ -123,6 +127,9 @@ def _find_davis(root: Path) -> tuple[Source, ...]:
 def split_sources(sources: tuple[Source, ...], seed: int, eval_fraction: float) -> dict[str, tuple[Source, ...]]:
     """The sources of each side: as the folder says, else by groups ranked by a hash of ``seed`` and name.
 
+    :param sources: at least one, from :func:`find_sources`
+    :param seed: of the split by hash
+    :param eval_fraction: share of the groups that go to "eval", 0..1
     :raises ValueError: if a side is empty
     """
     if sources[0].split is not None:
