@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+# More flags for pip, for instance --extra-index-url https://download.pytorch.org/whl/cpu for a PyTorch without CUDA.
+PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-slow format lint type check bench clean
@@ -12,7 +14,7 @@ help:  ## list the targets
 $(VENV)/.installed: setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed (MuJoCo 4); set PYTHON=... ")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[tests]'
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e '.[tests]'
 	@touch $@
 
 setup: $(VENV)/.installed  ## make .venv and install the package with its pinned dependencies

@@ -33,7 +33,7 @@ def commands(folder: Path, n_transitions: int, n_updates: int, n_timesteps: int)
         [*pretrain, "--objective", "ssi", "-o", str(ssi), *updates],
         [*pretrain, "--objective", "abisim", "--base", str(ssi), "-o", str(abisim), *updates],
         # The paper's rollouts of 65,536 steps and learning rate of 2.5e-5 are made for 7 million steps.
-        ["sb3_abisim.zoo", "train", "--algo", "ppo", "--env", ENV_ID, "--conf-file", f"abisim={abisim}",
+        ["sb3_abisim.zoo", "train", "--algo", "ppo", "--env", ENV_ID, "--conf-file", f"abisim={abisim},frozen",
          "-n", str(n_timesteps), "-f", str(folder / "logs"), "--seed", "0", "--verbose", "0", "-P",
          "--eval-freq", "-1", "-params", "n_envs:16", "n_steps:128", "batch_size:256", "n_epochs:4",
          "learning_rate:3e-4"],

@@ -28,6 +28,10 @@ class Encoder(nn.Module):
         self.layers = layers
         self.features_dim = features_dim
         self._constructor_kwargs = constructor_kwargs
+        self.offset: th.Tensor
+        self.scale: th.Tensor
+        self.register_buffer("offset", th.zeros(features_dim))
+        self.register_buffer("scale", th.ones(()))
 
     def spec(self) -> dict[str, Any]:
         """The architecture as JSON: ``make_encoder(space, spec["name"], **spec["kwargs"])`` builds it again."""
@@ -41,7 +45,25 @@ class Encoder(nn.Module):
         """
         # 2 x - 1 in one pass over memory.
         features: th.Tensor = self.layers(th.add(-1.0, observations, alpha=2.0))
-        return features
+        return (features - self.offset) * self.scale
+
+    @th.no_grad()
+    def standardize(self, observations: th.Tensor) -> None:
+        """Shift and scale the embedding so that its numbers have mean 0 and, on average, variance 1.
+
+        One factor for all of them: distances between embeddings keep their ratios. Pretraining leaves the scale
+        arbitrary (an L1 penalty makes it small, since the head can undo that), but the networks that RL puts on top
+        start from weights made for inputs of variance 1.
+
+        :param observations: float (batch, channels, height, width) in 0..1, many enough for a mean
+        :raises ValueError: if the embedding is the same for all of them
+        """
+        embeddings = self(observations)
+        variance = embeddings.var(dim=0, correction=0).mean()
+        if not float(variance) > 0:
+            raise ValueError("the embedding is the same for all observations: nothing was learned, or it has collapsed")
+        self.offset += embeddings.mean(dim=0) / self.scale
+        self.scale /= variance.sqrt()
 
 
 class Nav2DEncoder(Encoder):

@@ -79,12 +79,16 @@ def pretrain(
 def read_env_id(data: Path) -> str:
     """The environment id of a finished dataset, without opening the rest of it.
 
+    :param data: the dataset's folder
     :raises ValueError: if the folder holds none
     """
     meta_path = data / "meta.json"
     if not meta_path.is_file():
         raise ValueError(f"{data} holds no finished dataset (no meta.json); run sb3_abisim.collect first")
-    return str(json.loads(meta_path.read_text())["env_id"])
+    try:
+        return str(json.loads(meta_path.read_bytes())["env_id"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{meta_path} was not written by sb3_abisim.collect ({error!r}); give its folder") from error
 
 
 def _parse_overrides(words: list[str]) -> dict[str, Any]:
@@ -93,8 +97,16 @@ def _parse_overrides(words: list[str]) -> dict[str, Any]:
         name, colon, value = word.partition(":")
         if not colon:
             raise ValueError(f"settings are given as name:value, got {word!r}")
-        overrides[name] = yaml.safe_load(value)
+        overrides[name] = _number_or_same(yaml.safe_load(value))
     return overrides
+
+
+def _number_or_same(value: Any) -> Any:
+    # YAML 1.1 takes 1e-4, without a dot, for a text.
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -112,7 +124,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> None:
-    """The command; see ``--help``."""
+    """The command; see ``--help``.
+
+    :param argv: its words; the program's arguments by default
+    """
     parser = _parser()
     args = parser.parse_args(argv)
     data = Path(args.data)
@@ -127,7 +142,7 @@ def main(argv: list[str] | None = None) -> None:
         pretrain(args.objective, data, args.output, config, args.base, args.seed, args.device, verbose=args.verbose)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
-    except FloatingPointError as error:
+    except (FloatingPointError, OSError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from the last checkpoint", file=sys.stderr)

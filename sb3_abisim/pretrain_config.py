@@ -1,6 +1,7 @@
 """What a pretraining run is made of: the settings, read from the YAML files keyed by environment id."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -42,15 +43,23 @@ class PretrainConfig:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
-        if not self.learning_rate_at(0) > 0:
-            raise ValueError(f"learning_rate must be above 0, got {self.learning_rate!r}")
-        if not 0 <= self.holdout < 1:
+        if not 0 < self.learning_rate_at(0) < math.inf:
+            raise ValueError(f"learning_rate must be a number above 0, got {self.learning_rate!r}")
+        if not isinstance(self.holdout, int | float) or not 0 <= self.holdout < 1:
             raise ValueError(f"holdout must lie in [0, 1), got {self.holdout!r}")
+        for name in ("network_kwargs", "objective_kwargs"):
+            if not isinstance(getattr(self, name), dict):
+                raise ValueError(f"{name} must be a mapping, got {getattr(self, name)!r}")
 
     def learning_rate_at(self, n_updates: int) -> float:
-        """The learning rate of the update that follows ``n_updates`` others."""
-        if not isinstance(self.learning_rate, str):
+        """The learning rate of an update.
+
+        :param n_updates: how many updates came before it
+        """
+        if isinstance(self.learning_rate, int | float):
             return self.learning_rate
+        if not isinstance(self.learning_rate, str):
+            raise ValueError(f"learning_rate must be a number or lin_NUMBER, got {self.learning_rate!r}")
         try:
             initial = float(self.learning_rate.removeprefix("lin_"))
         except ValueError:
@@ -63,6 +72,7 @@ class PretrainConfig:
     def from_mapping(cls, mapping: dict[str, Any]) -> "PretrainConfig":
         """Build from YAML or keyword settings.
 
+        :param mapping: setting to value
         :raises ValueError: for a key that is no setting
         """
         known = {field.name for field in dataclasses.fields(cls)}
@@ -86,5 +96,7 @@ def load_config(objective: str, env_id: str, overrides: dict[str, Any] | None = 
     mapping = dict(entries.get(env_id, entries["default"]))
     for name, value in (overrides or {}).items():
         outer, _, inner = name.partition(".")
+        if inner and not isinstance(mapping.get(outer, {}), dict):
+            raise ValueError(f"{outer} has no parts, so {name!r} cannot be set")
         mapping[outer] = {**mapping.get(outer, {}), inner: value} if inner else value
     return PretrainConfig.from_mapping(mapping)

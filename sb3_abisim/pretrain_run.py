@@ -24,6 +24,7 @@ from sb3_abisim.pretrain_config import PretrainConfig
 from sb3_abisim.training_state import load_training_state, save_training_state
 
 N_GOLDEN = 8
+N_STANDARDIZE = 4096
 N_HOLDOUT_BATCHES = 8
 
 
@@ -65,8 +66,8 @@ class PretrainRun:
             raise ValueError(f"objective_kwargs do not fit {objective}: {error}") from error
         # Channels last is the layout in which small convolutions are fastest on CPUs; the numbers are the same.
         self.module: Objective = module.to(self.device, memory_format=th.channels_last)  # type: ignore[call-overload]
-        trained = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
-        self.optimizer = th.optim.Adam(trained, lr=config.learning_rate_at(0))
+        self._trained = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
+        self.optimizer = th.optim.Adam(self._trained, lr=config.learning_rate_at(0))
         self.n_updates = 0
         self.rows: list[dict[str, float]] = []
 
@@ -107,6 +108,7 @@ class PretrainRun:
         starts = dataset.valid_starts(self.config.k)
         golden = dataset.frames(starts[:: max(1, len(starts) // N_GOLDEN)][:N_GOLDEN])
         encoder = self.module.encoder.cpu()
+        encoder.standardize(self._sample_observations())
         card = self._card(n_parameters=sum(p.numel() for p in encoder.parameters()))
         text = json.dumps(card, indent=1, sort_keys=True) + "\n"
         write_atomic(self.output.with_suffix(".json"), lambda file: file.write(text.encode()))
@@ -125,13 +127,23 @@ class PretrainRun:
         for checkpoint in self._checkpoints():
             checkpoint.unlink()
 
+    def _sample_observations(self) -> th.Tensor:
+        """Observations from all over the dataset, as floats on the CPU."""
+        starts = self.dataset.valid_starts(self.config.k, part="train")
+        frames = self.dataset.frames(starts[:: max(1, len(starts) // N_STANDARDIZE)][:N_STANDARDIZE])
+        observations = preprocess_obs(th.as_tensor(frames), self.dataset.observation_space)
+        assert isinstance(observations, th.Tensor)
+        return observations
+
     def _card(self, n_parameters: int) -> dict[str, Any]:
         """What a reader wants to know of an encoder; free of times and paths, so that equal runs write equal cards."""
         dataset = self.dataset
         return {
             "settings": self.settings,
             "commands": reproducing_commands(self.settings, self.config, dataset.meta),
-            "dataset": {"digest": dataset.digest, "env_id": dataset.env_id, "n_transitions": dataset.n_transitions},
+            "dataset": {
+                key: dataset.meta[key] for key in ("digest", "env_id", "env_kwargs", "fingerprint", "n_transitions")
+            },
             "features_dim": self.module.encoder.features_dim,
             "n_parameters": n_parameters,
             "metrics": self.rows[-1] if self.rows else {},
@@ -143,7 +155,11 @@ class PretrainRun:
     # Training.
 
     def train(self, progress_bar: bool, verbose: int) -> None:
-        """Train to the end and write the results."""
+        """Train to the end and write the results.
+
+        :param progress_bar: show one
+        :param verbose: 1 prints the log's rows
+        """
         th.manual_seed(self.seed)
         self.restore()
         logger = self._logger(verbose)
@@ -182,18 +198,21 @@ class PretrainRun:
         loss, terms = self.module.loss(batch)
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        gradients = [p.grad for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
-        norm = th.nn.utils.get_total_norm(gradients)
-        for name, value in {"loss": loss, **terms, "gradient norm": norm}.items():
-            if not bool(th.isfinite(value)):
-                raise FloatingPointError(
-                    f"{name} is {float(value.detach())} at update {self.n_updates}: the weights were left as they were "
-                    f"and checkpoints stay in {self.folder}; try a smaller learning_rate"
-                )
+        gradients = [parameter.grad for parameter in self._trained if parameter.grad is not None]
+        self._require_finite({"loss": loss, **terms, "gradient norm": th.nn.utils.get_total_norm(gradients)})
         self.optimizer.step()
         self.module.after_step()
+        self._require_finite({"norm of the weights": th.nn.utils.get_total_norm(self._trained)})
         self.n_updates += 1
         return {"loss": loss.detach(), **terms}
+
+    def _require_finite(self, values: dict[str, th.Tensor]) -> None:
+        for name, value in values.items():
+            if not bool(th.isfinite(value)):
+                raise FloatingPointError(
+                    f"{name} is {float(value.detach())} at update {self.n_updates}; the checkpoints before it stay in "
+                    f"{self.folder}; try a smaller learning_rate and another output"
+                )
 
     def _batches(self) -> Iterator[TensorBatch]:
         """The batches from the present position to the end; a position is (epoch, batch within it)."""

@@ -56,3 +56,24 @@ def test_refuses(shape, name, kwargs, message):
 def test_other_channel_counts():
     encoder = make_encoder(image_space(4, 64, 64), "PointMazeEncoder", n_input_channels=4, features_dim=7)
     assert encoder(th.rand(1, 4, 64, 64)).shape == (1, 7)
+
+
+def test_standardize_keeps_ratios_of_distances():
+    th.manual_seed(0)
+    encoder = make_encoder(image_space(3, 15, 15))
+    x, y = th.rand(500, 3, 15, 15), th.rand(20, 3, 15, 15)
+    before = th.cdist(encoder(y), encoder(y), p=1).detach()
+    for _ in range(2):
+        encoder.standardize(x)
+        z = encoder(x)
+        assert th.allclose(z.mean(dim=0), th.zeros(576), atol=1e-4)
+        assert float(z.detach().var(dim=0, correction=0).mean()) == pytest.approx(1.0, rel=1e-4)
+    after = th.cdist(encoder(y), encoder(y), p=1).detach()
+    ratios = (after / before)[~th.eye(20, dtype=th.bool)]
+    assert float(ratios.max() / ratios.min()) == pytest.approx(1.0, rel=1e-3) and not float(ratios.mean()) == 1.0
+
+
+def test_standardize_refuses_a_collapsed_embedding():
+    encoder = make_encoder(image_space(3, 15, 15))
+    with pytest.raises(ValueError, match="collapsed"):
+        encoder.standardize(th.zeros(4, 3, 15, 15))

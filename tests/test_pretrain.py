@@ -246,6 +246,10 @@ def test_held_out_transitions_are_not_trained_on(data, tmp_path, monkeypatch):
         (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "objective_kwargs.gamma:3"], "gamma"),
         (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "n_updates"], "name:value"),
         (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "batch_size:0"], "batch_size"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "n_updates.x:3"], "n_updates"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "holdout:much"], "holdout"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "learning_rate:null"], "learning_rate"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "objective_kwargs:3"], "objective_kwargs"),
         (["--objective", "ssi", "--env", "Nav2D-v0", "-params", "batch_size:5000"], "batch_size"),
         (["--objective", "ssi", "--env", "Nav2D-v0", "--base", "x"], "base encoder belongs to 'abisim'"),
         (["--objective", "abisim", "--env", "Nav2D-v0", "--base", "missing.safetensors"], "missing.safetensors"),
@@ -259,6 +263,36 @@ def test_command_line_mistakes_exit_2(data, tmp_path, capsys, arguments, message
     assert error.value.code == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.glob("*.safetensors"))
+
+
+def test_numbers_without_a_dot(data, tmp_path):
+    """YAML 1.1 takes 1e-4 for a text, users of the zoo do not."""
+    from sb3_abisim.pretrain import _parse_overrides
+
+    words = ["learning_rate:1e-4", "objective_kwargs.l1_penalty:2e-3", "learning_rate:lin_1e-3"]
+    assert _parse_overrides(words[:2]) == {"learning_rate": 1e-4, "objective_kwargs.l1_penalty": 2e-3}
+    assert _parse_overrides(words[2:]) == {"learning_rate": "lin_1e-3"}
+
+
+def test_folder_of_someone_else(tmp_path, capsys):
+    (tmp_path / "meta.json").write_text("[1, 2]")
+    with pytest.raises(SystemExit) as error:
+        main(["--objective", "ssi", "--env", "Nav2D-v0", "--data", str(tmp_path), "-o", "x.safetensors"])
+    assert error.value.code == 2 and "collect" in capsys.readouterr().err
+
+
+def test_weights_that_are_not_finite_are_never_saved(data, tmp_path, monkeypatch):
+    plain = InverseDynamics.after_step
+
+    def broken(self):
+        plain(self)
+        with th.no_grad():
+            self.encoder.layers[0].weight[0, 0, 0, 0] = float("inf")
+
+    monkeypatch.setattr(InverseDynamics, "after_step", broken)
+    with pytest.raises(FloatingPointError, match="weights.* at update 0"):
+        run(data, tmp_path / "ssi.safetensors", log_interval=1, checkpoint_interval=1)
+    assert not list((tmp_path / "ssi.run").glob("checkpoint-*"))
 
 
 def test_missing_dataset(tmp_path, capsys):
