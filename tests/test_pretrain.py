@@ -290,7 +290,7 @@ def test_weights_that_are_not_finite_are_never_saved(data, tmp_path, monkeypatch
             self.encoder.layers[0].weight[0, 0, 0, 0] = float("inf")
 
     monkeypatch.setattr(InverseDynamics, "after_step", broken)
-    with pytest.raises(FloatingPointError, match="weights.* at update 0"):
+    with pytest.raises(FloatingPointError, match=r"weights.* at update 0"):
         run(data, tmp_path / "ssi.safetensors", log_interval=1, checkpoint_interval=1)
     assert not list((tmp_path / "ssi.run").glob("checkpoint-*"))
 
