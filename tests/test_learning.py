@@ -13,11 +13,9 @@ GOOD_RETURN = -60
 def test_ppo_learns_on_a_frozen_encoder(tmp_path, env_id):
     from sb3_abisim.zoo import main
 
-    main(
-        ["train", "--algo", "ppo", "--env", env_id, "--conf-file", "abisim,frozen", "-n", str(N_TIMESTEPS)]
-        + ["-f", str(tmp_path), "--seed", "0", "--verbose", "0", "--eval-freq", "-1"]
-        + ["-params", "n_envs:16", "n_steps:128", "batch_size:256", "n_epochs:4", "learning_rate:3e-4"]
-    )
+    command = f"train --algo ppo --env {env_id} --conf-file abisim,frozen -n {N_TIMESTEPS} --seed 0 --verbose 0"
+    faster = "-params n_envs:16 n_steps:128 batch_size:256 n_epochs:4 learning_rate:3e-4"
+    main([*command.split(), "--eval-freq", "-1", "-f", str(tmp_path), *faster.split()])
     episodes = load_results(str(tmp_path / "ppo" / f"{env_id}_1")).sort_values("t")
     first, last = episodes["r"][:100].mean(), episodes["r"][-200:].mean()
     assert first < RANDOM_RETURN + 25, "training starts near the return of random actions"
