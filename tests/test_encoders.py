@@ -1,0 +1,44 @@
+"""The shipped encoders are what their cards and the committed settings say."""
+
+import dataclasses
+import json
+
+import pytest
+
+from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.pretrain_config import load_config
+from sb3_abisim.resources import resource_path
+
+FILES = sorted(resource_path("encoders").glob("*/*.safetensors"))
+
+
+def test_there_are_some():
+    assert {path.parent.name for path in FILES} == {
+        "Nav2D-v0",
+        "PointMaze-v0",
+        "ContinuousPointMaze-v0",
+        "DistractorPointMaze-v0",
+    }
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_shipped_encoder(path):
+    file, card = load_encoder(path), json.loads(path.with_suffix(".json").read_text())
+    contract = file.contract
+    assert path.stat().st_size < 1_000_000
+    assert (contract["env_id"], contract["objective"]) == (path.parent.name, path.stem)
+    assert card["settings"] == contract["settings"] and card["dataset"]["digest"] == contract["dataset_digest"]
+    assert card["dataset"]["n_transitions"] >= 200_000
+    committed = dataclasses.asdict(load_config(path.stem, path.parent.name))
+    assert {key: contract["settings"][key] for key in committed} == committed
+    assert card["curves"]["n_updates"][-1] == committed["n_updates"]
+    if path.stem == "abisim":
+        assert contract["settings"]["base_digest"] == load_encoder(path.with_stem("ssi")).digest
+
+
+def test_the_table_is_made_of_the_cards():
+    table = (resource_path("encoders") / "README.md").read_text()
+    for path in FILES:
+        settings = json.loads(path.with_suffix(".json").read_text())["settings"]
+        (row,) = [line for line in table.splitlines() if f"`{path.parent.name}/{path.stem}`" in line]
+        assert f"| {settings['n_updates']:,} |" in row
