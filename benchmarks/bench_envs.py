@@ -175,6 +175,15 @@ def measure(rounds: int, seconds: float) -> list[str]:
     return rows
 
 
+def _require_renderer(gl: str) -> None:
+    try:
+        import mujoco
+
+        mujoco.GLContext(64, 64).free()
+    except Exception as error:  # what a missing library raises depends on the library
+        sys.exit(f"MuJoCo cannot render with {gl} ({error!r}); apt-get install libegl1 libgl1")
+
+
 def main(argv: list[str] | None = None) -> None:
     """Measure and write the table; exits 1 where a target is missed."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_envs", description=__doc__)
@@ -189,6 +198,7 @@ def main(argv: list[str] | None = None) -> None:
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     warnings.simplefilter("ignore")
+    _require_renderer(args.gl)
     rows = measure(args.rounds, args.seconds)
     text = "\n".join(
         [

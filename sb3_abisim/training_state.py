@@ -38,6 +38,9 @@ def load_training_state(
 ) -> dict[str, Any]:
     """Put a checkpoint back into a module, its optimiser and the random state.
 
+    :param path: the file
+    :param module: gets parameters and buffers
+    :param optimizer: gets its state
     :param settings: of the present run; must equal those of the checkpoint
     :return: the metadata
     :raises ValueError: for a damaged file or another run's checkpoint

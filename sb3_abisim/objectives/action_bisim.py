@@ -55,7 +55,12 @@ def action_bisim_target(base_distance: th.Tensor, next_distance: th.Tensor, c: f
 
 
 def l1_distance(x: th.Tensor, y: th.Tensor) -> th.Tensor:
-    """L1 distances of embeddings, (n, features_dim) each, as (n,)."""
+    """L1 distances between the rows of two tensors.
+
+    :param x: (n, features_dim)
+    :param y: (n, features_dim)
+    :return: (n,)
+    """
     return (x - y).abs().sum(dim=1)
 
 
@@ -66,6 +71,10 @@ def w1_gaussian(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: t
     folded normal, ``E|m + s z|`` with m, s the differences of means and standard deviations. Under the L1 norm the
     dimensions add up. With equal standard deviations this is the L1 distance of the means.
 
+    :param mean_i: (..., features_dim), as the other three
+    :param std_i: standard deviations, above 0
+    :param mean_j: of the other Gaussian
+    :param std_j: of the other Gaussian
     :return: distances, summed over the last dimension
     """
     m, s = mean_i - mean_j, (std_i - std_j).abs()
@@ -100,12 +109,22 @@ class ForwardModel(nn.Module):
         self.network = MLP(*self.dims)
 
     def forward(self, phi: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Mean and standard deviation, each (batch, features_dim); the mean is predicted as a change of ``phi``."""
+        """Mean and standard deviation of the next embedding; the mean is predicted as a change of ``phi``.
+
+        :param phi: embeddings, (batch, features_dim)
+        :param actions: action inputs, (batch, action_dim)
+        :return: two tensors (batch, features_dim)
+        """
         change, log_std = self.network(th.cat([phi, actions], dim=1)).chunk(2, dim=1)
         return phi + change, log_std.clamp(*_LOG_STD_RANGE).exp()
 
     def nll(self, phi: th.Tensor, actions: th.Tensor, phi_next: th.Tensor) -> th.Tensor:
-        """Eq. 6: negative log-likelihood of the next embedding, mean over batch and dimensions."""
+        """Eq. 6: negative log-likelihood of the next embedding, mean over batch and dimensions.
+
+        :param phi: embeddings, (batch, features_dim); pass them detached, as the objective does
+        :param actions: action inputs, (batch, action_dim)
+        :param phi_next: embeddings that followed, (batch, features_dim)
+        """
         mean, std = self(phi, actions)
         log_prob: th.Tensor = th.distributions.Normal(mean, std).log_prob(phi_next)  # type: ignore[no-untyped-call]
         return -log_prob.mean()
@@ -190,7 +209,11 @@ class ActionBisimulation(Objective):
         self.register_buffer("n_updates", th.zeros((), dtype=th.int64))
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """Eq. 8 (and Eq. 6 for the forward model); gradients reach the encoder and the forward model alone."""
+        """Eq. 8 (and Eq. 6 for the forward model); gradients reach the encoder and the forward model alone.
+
+        :param batch: transitions with k = 1
+        :raises ValueError: with ``expectation="behaviour"``, if no two of them took the same action
+        """
         i, j = self._sample_pairs(batch.actions)
         phi = self.encoder(batch.observations)
         with th.no_grad():

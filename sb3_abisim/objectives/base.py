@@ -56,13 +56,20 @@ class Objective(nn.Module):
         return self.n_actions or int(self.action_space.shape[0])  # type: ignore[index]
 
     def action_inputs(self, actions: th.Tensor) -> th.Tensor:
-        """Actions as network inputs, float32 (batch, action_dim)."""
+        """Actions as network inputs.
+
+        :param actions: as in :class:`TensorBatch`
+        :return: float32 (batch, action_dim)
+        """
         if self.n_actions is None:
             return actions
         return nn.functional.one_hot(actions, self.n_actions).float()
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """The scalar to minimise, and its named terms (detached) for the log."""
+        """The scalar to minimise, and its named terms (detached) for the log.
+
+        :param batch: transitions
+        """
         raise NotImplementedError
 
     def after_step(self) -> None:

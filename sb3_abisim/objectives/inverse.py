@@ -85,7 +85,10 @@ class InverseDynamics(Objective):
         self.register_buffer("accuracy", th.zeros(()))
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """Eq. 5 on a batch; terms ``prediction``, ``l1_norm``, ``beta`` and ``accuracy``."""
+        """Eq. 5 on a batch; terms ``prediction``, ``l1_norm``, ``beta`` and ``accuracy``.
+
+        :param batch: transitions (s_t, a_t, s_{t+k})
+        """
         # One pass for both ends of the transition.
         both = self.encoder(th.cat([batch.observations, batch.next_observations]))
         psi, psi_next = both.chunk(2)
