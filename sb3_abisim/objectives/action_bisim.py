@@ -230,7 +230,8 @@ class ActionBisimulation(Objective):
             forward_loss = self.forward_model.nll(phi_target, self.action_inputs(batch.actions), phi_next)
             terms["forward_nll"] = forward_loss
         target = action_bisim_target(l1_distance(psi[i], psi[j]), next_distance, self.c)
-        distance = l1_distance(phi[i], phi[j])
+        # Unlike phi[i], the gradient of index_select adds up in a fixed order on several threads, too.
+        distance = l1_distance(phi.index_select(0, i), phi.index_select(0, j))
         metric_loss = LOSSES[self.distance_loss](distance, target)
         l1_norm = phi.abs().sum(dim=1).mean()
         terms |= {"metric": metric_loss, "distance": distance.mean(), "target": target.mean(), "l1_norm": l1_norm}
