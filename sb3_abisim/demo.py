@@ -73,6 +73,7 @@ def draw_learning_curve(run: Path, path: Path, n_smooth: int = 100) -> None:
         values = episodes[column].astype(float)
         axis.plot(steps, values.rolling(n_smooth, min_periods=n_smooth // 2).mean())
         axis.set(xlabel="environment steps", ylabel=f"{label} (mean of {n_smooth} episodes)")
+        axis.locator_params(axis="x", nbins=5)
         axis.grid(alpha=0.3)
     figure.suptitle(f"PPO on the action-bisimulation encoder, {ENV_ID}")
     figure.savefig(path, dpi=120)
@@ -123,8 +124,8 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m sb3_abisim.demo", description=__doc__.split("\n\n")[0])
     parser.add_argument("-o", "--output", default="demo", metavar="DIR", help="folder for everything (default: demo)")
     parser.add_argument("--n-transitions", type=int, default=50_000)
-    parser.add_argument("--n-updates", type=int, default=1_500)
-    parser.add_argument("--n-timesteps", type=int, default=200_000)
+    parser.add_argument("--n-updates", type=int, default=2_000)
+    parser.add_argument("--n-timesteps", type=int, default=250_000)
     args = parser.parse_args(argv)
     # Now, not after ten minutes.
     missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
