@@ -1,4 +1,4 @@
-"""The exact action-bisimulation metric on finite MDPs (the paper's Eq. 4), the reference that encoders are held against.
+"""The exact action-bisimulation metric on finite MDPs (the paper's Eq. 4), a reference for encoders.
 
 ``d(i, j) = (1 - c) base(i, j) + c E_a[W_1(d)(p(.|i, a), p(.|j, a))]``, iterated to its fixed point. The map contracts
 by the factor c in the largest difference, so there is one fixed point, and a step's size bounds what is left to go.
@@ -34,8 +34,8 @@ def action_bisim_metric(
         (n, n_actions, n) that add up to 1
     :param other_transitions: of the second MDP, in the same form with m for n; None for the first one's
     :param c: weight of the recursive term, 0 <= c < 1
-    :param action_weights: the distribution that E_a takes, (n_actions,) or one per pair, (n, m, n_actions); None for the
-        uniform one. See :func:`behaviour_weights`
+    :param action_weights: the distribution that E_a takes, (n_actions,) or one per pair, (n, m, n_actions); None
+        for the uniform one. See :func:`behaviour_weights`
     :param tol: largest error of the result, relative to the largest base distance
     :return: (n, m)
     :raises ValueError: for shapes that do not fit, or values out of range

@@ -129,14 +129,44 @@ def test_pairs_are_different_transitions_with_the_same_action():
     objective, actions = make(expectation="behaviour", n_pairs=5), th.tensor([0, 1, 0, 1, 1, 0, 0])
     seen = set()
     for _ in range(50):
-        i, j = objective._sample_pairs(actions)
+        i, j = objective._sample_pairs(actions, th.rand(len(actions), 5))
         assert len(i) == 5 and bool((actions[i] == actions[j]).all())
         drawn = {frozenset(pair) for pair in zip(i.tolist(), j.tolist(), strict=True)}
         assert len(drawn) == 5 and all(len(pair) == 2 for pair in drawn)
         seen |= drawn
     assert len(seen) == 6 + 3, "every pair with equal actions gets its turn"
     with pytest.raises(ValueError, match="same action"):
-        objective._sample_pairs(th.tensor([0, 1]))
+        objective._sample_pairs(th.tensor([0, 1]), th.rand(2, 5))
+
+
+@th.no_grad()
+def test_near_pairs_loss_equals_loop():
+    # 12 states, 10 pairs: the 5 nearest in the base, and 5 at random, which this test reads from the generator.
+    objective = make(expectation="behaviour", distance_loss="l1", c=0.7, pairs="near", n_pairs=10)
+    batch = make_batch(n=12)
+    psi = objective.base_encoder(batch.observations)
+    phi, phi_next = objective.encoder(batch.observations), objective.target_encoder(batch.next_observations)
+    same = [(i, j) for i in range(12) for j in range(i + 1, 12) if batch.actions[i] == batch.actions[j]]
+    assert len(same) > 20
+    th.manual_seed(5)
+    chosen = sorted(same, key=lambda pair: l1(psi[pair[0]], psi[pair[1]]))[:5]
+    chosen += [same[k] for k in th.randperm(len(same))[:5].tolist()]
+    mean = sum(l1(psi[i], psi[j]) for i, j in chosen) / 10
+    errors = []
+    for i, j in chosen:
+        base = l1(psi[i], psi[j])
+        target = 0.3 * base + 0.7 * l1(phi_next[i], phi_next[j])
+        errors.append(mean / (base + 0.05 * mean) * abs(l1(phi[i], phi[j]) - target))
+    th.manual_seed(5)
+    assert float(objective.loss(batch)[0]) == pytest.approx(sum(errors) / 10, rel=1e-4)
+
+
+@th.no_grad()
+def test_near_pairs_of_a_collapsed_base_are_finite():
+    objective = make(pairs="near")
+    for parameter in objective.base_encoder.parameters():
+        parameter.zero_()
+    assert th.isfinite(objective.loss(make_batch())[0])
 
 
 def test_same_action_pairs_of_continuous_actions():
@@ -251,6 +281,7 @@ def test_converges_to_the_metric_of_a_chain(expectation):
         ({"expectation": "both"}, "both"),
         ({"distance_loss": "l3"}, "l3"),
         ({"wasserstein": "w2"}, "w2"),
+        ({"pairs": "far"}, "far"),
         ({"expectation": "behaviour", "wasserstein": "gaussian"}, "forward model"),
         ({"forward_reset_interval": 0}, "forward_reset_interval"),
     ],

@@ -86,6 +86,17 @@ def _neighbours() -> NDArray[np.int64]:
 _NEIGHBOURS = _neighbours()
 
 
+def next_cells(obstacles: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Where each move leads from each cell, as cell indices (y * SIZE + x).
+
+    :param obstacles: by cell, (SIZE * SIZE,)
+    :return: (SIZE * SIZE, n_actions)
+    """
+    stay = np.arange(_N_CELLS)[:, None]
+    cells: NDArray[np.int64] = np.where(obstacles[_NEIGHBOURS], stay, _NEIGHBOURS)
+    return cells
+
+
 class Nav2DVectorEnv(BatchEnv):
     """Navigate a 15 x 15 grid to its centre; ``num_envs`` copies at once. ``Nav2DEnv`` is the batch of one.
 
@@ -151,8 +162,7 @@ class Nav2DVectorEnv(BatchEnv):
             self._pictures[i, 0] = 0
             self._pictures[i, 0, cell] = 255
             self._pictures[i, 1] = np.where(obstacles, 255, 0)
-            stay = np.arange(_N_CELLS)[:, None]
-            self._targets[i, :_N_CELLS] = self._first[i] + np.where(obstacles[_NEIGHBOURS], stay, _NEIGHBOURS)
+            self._targets[i, :_N_CELLS] = self._first[i] + next_cells(obstacles)
 
     def _draw_random(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
         """An agent's cell and obstacles (SIZE * SIZE,) with a path to the goal."""

@@ -22,6 +22,14 @@ little beside the n embeddings. Two expectations over actions are offered:
   one: the minimiser of the paper's absolute difference would be the median over actions, and an obstacle that
   blocks one of four moves would not count.
 
+Two ways to choose the pairs:
+
+* ``pairs="random"``: uniformly (the paper).
+* ``pairs="near"``: half of them are the batch's nearest by base distance, and every error counts relative to its base
+  distance. Random pairs differ in where the agent is, so their distances are nearly sums of two norms, which say little
+  about what else an embedding depends on; pairs with the agent in like places tell the influence of each obstacle. The
+  choice looks at the states alone, so the expectation over actions stays what it is.
+
 Departures that the released code makes and that are options here: smooth L1 as loss, resetting the forward model
 at an interval, starting from the base encoder's weights.
 """
@@ -40,6 +48,11 @@ from sb3_abisim.objectives.base import Objective, TensorBatch
 LOSSES = {"l1": nn.functional.l1_loss, "smooth_l1": nn.functional.smooth_l1_loss, "mse": nn.functional.mse_loss}
 EXPECTATIONS = ("uniform", "behaviour")
 WASSERSTEIN = ("means", "gaussian")
+PAIRS = ("random", "near")
+# Share of near pairs for pairs="near", and what is added to base distances, in units of their mean, so that an error
+# counts at most 20 times as much as that of a pair at the mean.
+NEAR_SHARE = 0.5
+NEAR_FLOOR = 0.05
 HIDDEN_DIM = 256
 _LOG_STD_RANGE = (-5.0, 2.0)
 
@@ -62,6 +75,17 @@ def l1_distance(x: th.Tensor, y: th.Tensor) -> th.Tensor:
     :return: (n,)
     """
     return (x - y).abs().sum(dim=1)
+
+
+def relative_scale(base_distance: th.Tensor) -> th.Tensor:
+    """Factors on distances that make errors relative to the base distance, near 1 for a pair at the mean.
+
+    :param base_distance: of the pairs of a batch, (n_pairs,)
+    :return: (n_pairs,)
+    """
+    mean = base_distance.mean()
+    # All zero (a base that has collapsed) would divide by zero; any factor will do then.
+    return mean / (base_distance + NEAR_FLOOR * mean).clamp_min(th.finfo(mean.dtype).tiny)
 
 
 def w1_gaussian(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: th.Tensor) -> th.Tensor:
@@ -148,6 +172,7 @@ class ActionBisimulation(Objective):
     :param l1_penalty: weight of the mean L1 norm of the embedding in the loss. Distances of most pairs are sums of two
         norms, and parts of an embedding that see only far obstacles may fluctuate at no cost; a small penalty
         silences them
+    :param pairs: "random" or "near" (module docstring)
     :param n_pairs: pairs of states per update
     :param n_action_samples: continuous actions per update for "uniform"
     :param action_radius: see :func:`same_action_pairs`, for continuous "behaviour"
@@ -168,6 +193,7 @@ class ActionBisimulation(Objective):
         distance_loss: str = "l1",
         wasserstein: str = "means",
         l1_penalty: float = 0.0,
+        pairs: str = "random",
         n_pairs: int = 4096,
         n_action_samples: int = 8,
         action_radius: float = 0.2,
@@ -181,7 +207,12 @@ class ActionBisimulation(Objective):
             raise ValueError(f"l1_penalty must be a number of at least 0, got {l1_penalty}")
         if not 0 < tau <= 1:
             raise ValueError(f"tau must lie in (0, 1], got {tau}")
-        for value, known in ((expectation, EXPECTATIONS), (distance_loss, LOSSES), (wasserstein, WASSERSTEIN)):
+        for value, known in (
+            (expectation, EXPECTATIONS),
+            (distance_loss, LOSSES),
+            (wasserstein, WASSERSTEIN),
+            (pairs, PAIRS),
+        ):
             if value not in known:
                 raise ValueError(f"{value!r} is not one of {tuple(known)}")
         if expectation == "behaviour" and wasserstein != "means":
@@ -193,7 +224,7 @@ class ActionBisimulation(Objective):
         for name, count in (("n_pairs", n_pairs), ("n_action_samples", n_action_samples)):
             if count < 1:
                 raise ValueError(f"{name} must be at least 1, got {count}")
-        self.n_pairs = n_pairs
+        self.pairs, self.n_pairs = pairs, n_pairs
         self.n_action_samples, self.action_radius = n_action_samples, action_radius
         self.forward_reset_interval = forward_reset_interval
         if warm_start:
@@ -214,10 +245,11 @@ class ActionBisimulation(Objective):
         :param batch: transitions with k = 1
         :raises ValueError: with ``expectation="behaviour"``, if no two of them took the same action
         """
-        i, j = self._sample_pairs(batch.actions)
-        phi = self.encoder(batch.observations)
         with th.no_grad():
             psi = self.base_encoder(batch.observations)
+        i, j = self._sample_pairs(batch.actions, psi)
+        phi = self.encoder(batch.observations)
+        with th.no_grad():
             phi_next = self.target_encoder(batch.next_observations)
         terms: dict[str, th.Tensor] = {}
         forward_loss = th.zeros((), device=phi.device)
@@ -229,17 +261,19 @@ class ActionBisimulation(Objective):
                 next_distance = self._expected_w1(phi_target, i, j)
             forward_loss = self.forward_model.nll(phi_target, self.action_inputs(batch.actions), phi_next)
             terms["forward_nll"] = forward_loss
-        target = action_bisim_target(l1_distance(psi[i], psi[j]), next_distance, self.c)
+        base_distance = l1_distance(psi[i], psi[j])
+        target = action_bisim_target(base_distance, next_distance, self.c)
         # Unlike phi[i], the gradient of index_select adds up in a fixed order on several threads, too.
         distance = l1_distance(phi.index_select(0, i), phi.index_select(0, j))
-        metric_loss = LOSSES[self.distance_loss](distance, target)
+        scale = relative_scale(base_distance) if self.pairs == "near" else th.ones_like(base_distance)
+        metric_loss = LOSSES[self.distance_loss](scale * distance, scale * target)
         l1_norm = phi.abs().sum(dim=1).mean()
         terms |= {"metric": metric_loss, "distance": distance.mean(), "target": target.mean(), "l1_norm": l1_norm}
         loss = metric_loss + self.l1_penalty * l1_norm + forward_loss
         return loss, {name: term.detach() for name, term in terms.items()}
 
-    def _sample_pairs(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Indices of ``n_pairs`` different pairs of transitions (all, if there are fewer), each (n_pairs,)."""
+    def _sample_pairs(self, actions: th.Tensor, psi: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Indices of ``n_pairs`` pairs of different transitions (all, if there are fewer), each (n_pairs,)."""
         n = len(actions)
         if self.expectation == "behaviour":
             allowed = same_action_pairs(actions, self.action_radius)
@@ -251,7 +285,12 @@ class ActionBisimulation(Objective):
             raise ValueError(
                 f"no two of the batch's {n} transitions took the same action; set a larger batch_size or action_radius"
             )
-        chosen = th.randperm(len(pairs))[: self.n_pairs].to(actions.device)
+        n_near = int(NEAR_SHARE * self.n_pairs) if self.pairs == "near" else 0
+        chosen = th.randperm(len(pairs))[: self.n_pairs - n_near].to(actions.device)
+        if n_near:
+            i, j = pairs.unbind(dim=1)
+            base_distance = th.cdist(psi, psi, p=1.0)[i, j]
+            chosen = th.cat([base_distance.topk(min(n_near, len(pairs)), largest=False).indices, chosen])
         i, j = pairs[chosen].unbind(dim=1)
         return i, j
 

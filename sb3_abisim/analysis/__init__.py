@@ -1,0 +1,1 @@
+"""Instruments that show what an encoder has learned."""

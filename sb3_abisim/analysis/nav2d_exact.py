@@ -1,0 +1,269 @@
+"""A learned distance on Nav2D beside the exact one.
+
+A perturbation map answers: by how much does the distance between two states grow when one cell of the grid is toggled
+(an obstacle added or removed) and the agent stands where it stood? The learned answer is the L1 distance of the two
+embeddings; the exact one is the fixed point of the action-bisimulation metric whose base distance is that of the base
+encoder (:mod:`sb3_abisim.tabular`). Both are averaged over layouts and agents by the offset from agent to cell.
+
+The goal counts as any other cell here: the metric knows no reward, and random play passes over it.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.preprocessing import preprocess_obs
+
+from sb3_abisim.envs.nav2d import CHANNELS, GOAL, SIZE, next_cells
+from sb3_abisim.networks import Encoder
+from sb3_abisim.tabular import action_bisim_metric
+
+N_CELLS = SIZE * SIZE
+GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
+ENV_IDS = ("Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0")
+# Bins of the city-block distance from agent to cell, both ends included.
+BINS = ((1, 1), (2, 2), (3, 3), (4, 4), (5, 6), (7, 9), (10, 2 * (SIZE - 1)))
+# Far offsets that few agents see are noise.
+MIN_SAMPLES = 20
+# Far from the seeds that people type; datasets draw layouts from spawned seeds, which never equal these.
+HELD_OUT_SEED = 1_000_000
+TOLERANCE = 1e-3
+
+_Y, _X = np.divmod(np.arange(N_CELLS), SIZE)
+_DY, _DX = _Y[None] - _Y[:, None], _X[None] - _X[:, None]
+# Indices [agent, cell] into a map of offsets, (2 SIZE - 1) squared, and the city-block distance.
+_OFFSET = (_DY + SIZE - 1) * (2 * SIZE - 1) + _DX + SIZE - 1
+_DISTANCE = np.abs(_DY) + np.abs(_DX)
+
+Maps = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How a learned distance agrees with the exact one.
+
+    :param map_correlation: Spearman's, of the two mean perturbation maps
+    :param state_correlation: Spearman's, of distances between states of one layout, mean over layouts
+    :param profile: learned sensitivity by distance (:data:`BINS`), relative to the nearest
+    :param exact_profile: the exact one
+    :param profile_error: largest difference of the two
+    """
+
+    map_correlation: float
+    state_correlation: float
+    profile: tuple[float, ...]
+    exact_profile: tuple[float, ...]
+    profile_error: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def held_out_layouts(env_id: str, n_layouts: int, seed: int = HELD_OUT_SEED) -> NDArray[np.bool_]:
+    """Obstacles of fresh episodes.
+
+    :param env_id: one of :data:`ENV_IDS`
+    :param n_layouts: how many
+    :param seed: of the first episode; the next has the next seed
+    :return: (n_layouts, SIZE * SIZE)
+    :raises ValueError: for another environment
+    """
+    if env_id not in ENV_IDS:
+        raise ValueError(f"the exact metric is computed for {', '.join(ENV_IDS)}, got {env_id!r}")
+    env = gym.make(env_id)
+    pictures = np.array([env.reset(seed=seed + k)[0] for k in range(n_layouts)])
+    obstacles: NDArray[np.bool_] = pictures[:, CHANNELS.index("obstacles")].reshape(n_layouts, N_CELLS) > 0
+    return obstacles
+
+
+def reachable(obstacles: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Cells joined to the goal: those where the agent of an episode can be.
+
+    :param obstacles: (SIZE * SIZE,)
+    """
+    nexts = next_cells(obstacles)
+    reached = np.zeros(N_CELLS, dtype=bool)
+    front = np.array([GOAL_CELL])
+    while len(front):
+        reached[front] = True
+        front = np.unique(nexts[front])
+        front = front[~reached[front]]
+    return np.flatnonzero(reached)
+
+
+def pictures(obstacles: NDArray[np.bool_], agents: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Observations of a layout with the agent in each of some cells.
+
+    :param obstacles: (SIZE * SIZE,)
+    :param agents: cell indices, (n,)
+    :return: (n, 3, SIZE, SIZE)
+    """
+    frames = np.zeros((len(agents), len(CHANNELS), N_CELLS), dtype=np.uint8)
+    frames[:, CHANNELS.index("obstacles")] = np.where(obstacles, 255, 0)
+    frames[:, CHANNELS.index("goal"), GOAL_CELL] = 255
+    frames[np.arange(len(agents)), CHANNELS.index("agent"), agents] = 255
+    return frames.reshape(len(agents), len(CHANNELS), SIZE, SIZE)
+
+
+@th.no_grad()
+def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> th.Tensor:
+    """Embeddings of frames through SB3's preprocessing, (n, features_dim).
+
+    :param encoder: in evaluation mode
+    :param frames: (n, 3, SIZE, SIZE)
+    """
+    inputs = preprocess_obs(th.as_tensor(frames), gym.spaces.Box(0, 255, frames.shape[1:], np.uint8))
+    assert isinstance(inputs, th.Tensor)
+    features: th.Tensor = encoder(inputs)
+    return features
+
+
+def learned_maps(encoder: Encoder, layouts: NDArray[np.bool_]) -> Maps:
+    """L1 distances of embeddings with one cell toggled.
+
+    :param encoder: any encoder of Nav2D
+    :param layouts: (n_layouts, SIZE * SIZE)
+    :return: (n_layouts, agent's cell, toggled cell), NaN where there is no such pair
+    """
+    maps = np.full((len(layouts), N_CELLS, N_CELLS), np.nan)
+    for k, obstacles in enumerate(layouts):
+        agents = reachable(obstacles)
+        features = embed(encoder, pictures(obstacles, agents))
+        for cell in _togglable():
+            stay = agents != cell
+            other = embed(encoder, pictures(_toggled(obstacles, cell), agents[stay]))
+            maps[k, agents[stay], cell] = (features[th.as_tensor(stay)] - other).abs().sum(dim=1).numpy()
+    return maps
+
+
+def exact_maps(base: Encoder, layouts: NDArray[np.bool_], c: float) -> Maps:
+    """The same for the exact metric over a base encoder's distance.
+
+    :param base: the base encoder
+    :param layouts: (n_layouts, SIZE * SIZE)
+    :param c: weight of the recursive term
+    """
+    maps = np.full((len(layouts), N_CELLS, N_CELLS), np.nan)
+    for k, obstacles in enumerate(layouts):
+        agents = reachable(obstacles)
+        free, nexts, features = _states(base, obstacles)
+        for cell in _togglable():
+            other_free, other_nexts, other_features = _states(base, _toggled(obstacles, cell))
+            base_distance = th.cdist(features, other_features, p=1.0).numpy()
+            metric = action_bisim_metric(base_distance, nexts, other_nexts, c, tol=TOLERANCE)
+            stay = agents[agents != cell]
+            rows, columns = np.searchsorted(free, stay), np.searchsorted(other_free, stay)
+            maps[k, stay, cell] = metric[rows, columns]
+    return maps
+
+
+def exact_distances(base: Encoder, obstacles: NDArray[np.bool_], c: float) -> NDArray[np.float32]:
+    """Exact distances between the reachable states of a layout, (n, n) in the order of :func:`reachable`.
+
+    :param base: the base encoder
+    :param obstacles: (SIZE * SIZE,)
+    :param c: weight of the recursive term
+    """
+    free, nexts, features = _states(base, obstacles)
+    rows = np.searchsorted(free, reachable(obstacles))
+    base_distance = th.cdist(features, features, p=1.0).numpy()
+    metric: NDArray[np.float32] = action_bisim_metric(base_distance, nexts, c=c, tol=TOLERANCE)[np.ix_(rows, rows)]
+    return metric
+
+
+def mean_map(maps: Maps) -> NDArray[np.float64]:
+    """Mean by offset from agent to cell, (2 SIZE - 1, 2 SIZE - 1) by [dy, dx]; NaN for rare offsets.
+
+    :param maps: (n_layouts, agent's cell, toggled cell)
+    """
+    offsets = np.broadcast_to(_OFFSET, maps.shape)
+    seen = ~np.isnan(maps)
+    n_offsets = (2 * SIZE - 1) ** 2
+    counts = np.bincount(offsets[seen], minlength=n_offsets)
+    sums = np.bincount(offsets[seen], weights=maps[seen], minlength=n_offsets)
+    means: NDArray[np.float64] = np.divide(sums, counts, out=np.full(n_offsets, np.nan), where=counts >= MIN_SAMPLES)
+    return means.reshape(2 * SIZE - 1, 2 * SIZE - 1)
+
+
+def profile(maps: Maps) -> NDArray[np.float64]:
+    """Mean sensitivity by distance from the agent (:data:`BINS`), relative to the nearest.
+
+    :param maps: (n_layouts, agent's cell, toggled cell)
+    """
+    means = np.array([np.nanmean(maps[:, (low <= _DISTANCE) & (high >= _DISTANCE)]) for low, high in BINS])
+    relative: NDArray[np.float64] = means / means[0]
+    return relative
+
+
+class ExactReference:
+    """The exact side of the comparison, computed once for a base encoder and c; then any encoder is compared with it.
+
+    :param base: the base encoder, in evaluation mode
+    :param c: weight of the recursive term
+    :param env_id: one of :data:`ENV_IDS`
+    :param n_layouts: layouts to average over, about six seconds each
+    :param seed: see :func:`held_out_layouts`
+    """
+
+    def __init__(
+        self, base: Encoder, c: float, env_id: str = "Nav2D-v0", n_layouts: int = 10, seed: int = HELD_OUT_SEED
+    ) -> None:
+        self.layouts = held_out_layouts(env_id, n_layouts, seed)
+        self.maps = exact_maps(base, self.layouts, c)
+        self._distances = [exact_distances(base, obstacles, c) for obstacles in self.layouts]
+
+    def compare(self, encoder: Encoder) -> Comparison:
+        """Hold an encoder against the exact metric.
+
+        :param encoder: any encoder of Nav2D, in evaluation mode
+        """
+        maps = learned_maps(encoder, self.layouts)
+        learned, exact = mean_map(maps).ravel(), mean_map(self.maps).ravel()
+        # Not where the agent stands, nor where too few agents have looked.
+        seen = ~np.isnan(learned) & ~np.isnan(exact)
+        states = []
+        for obstacles, distances in zip(self.layouts, self._distances, strict=True):
+            features = embed(encoder, pictures(obstacles, reachable(obstacles)))
+            pairs = np.triu_indices(len(distances), k=1)
+            states.append(spearman(th.cdist(features, features, p=1.0).numpy()[pairs], distances[pairs]))
+        here, there = profile(maps), profile(self.maps)
+        return Comparison(
+            map_correlation=spearman(learned[seen], exact[seen]),
+            state_correlation=float(np.mean(states)),
+            profile=tuple(here.tolist()),
+            exact_profile=tuple(there.tolist()),
+            profile_error=float(np.abs(here - there).max()),
+        )
+
+
+def spearman(x: NDArray[Any], y: NDArray[Any]) -> float:
+    """Spearman's rank correlation; NaN if either is constant.
+
+    :param x: (n,)
+    :param y: (n,)
+    """
+    # Through ranks, since pandas needs SciPy for its own Spearman.
+    return float(pd.Series(x).rank().corr(pd.Series(y).rank()))
+
+
+def _togglable() -> NDArray[np.int64]:
+    """All cells but the goal's, which never holds an obstacle."""
+    return np.delete(np.arange(N_CELLS), GOAL_CELL)
+
+
+def _toggled(obstacles: NDArray[np.bool_], cell: int) -> NDArray[np.bool_]:
+    other = obstacles.copy()
+    other[cell] ^= True
+    return other
+
+
+def _states(base: Encoder, obstacles: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], th.Tensor]:
+    """Free cells, where each move leads as indices into them, and the base embedding with the agent there."""
+    free = np.flatnonzero(~obstacles)
+    nexts = np.searchsorted(free, next_cells(obstacles)[free])
+    return free, nexts, embed(base, pictures(obstacles, free))

@@ -1,0 +1,99 @@
+"""What an encoder sees, as numbers: ``python -m sb3_abisim.analyze exact ...``.
+
+``exact`` holds encoders of Nav2D against the exact action-bisimulation metric
+(:mod:`sb3_abisim.analysis.nav2d_exact`).
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_abisim.analysis.nav2d_exact import BINS, ENV_IDS, HELD_OUT_SEED, ExactReference
+from sb3_abisim.atomic import write_atomic
+from sb3_abisim.checkpoint import EncoderFile, load_encoder
+
+
+def exact(
+    encoders: list[str], base: str, c: float, env_id: str, n_layouts: int, seed: int = HELD_OUT_SEED
+) -> dict[str, Any]:
+    """Compare encoders with the exact metric over a base encoder.
+
+    :param encoders: files or names
+    :param base: file or name of the encoder whose distance is the metric's base
+    :param c: weight of the recursive term
+    :param env_id: one of the Nav2D environments
+    :param n_layouts: held-out layouts to average over
+    :param seed: of the first layout
+    :return: JSON types: the settings, and per encoder its digest and the fields of ``Comparison``
+    :raises ValueError: for encoders of other observations or another environment
+    """
+    if n_layouts < 1:
+        raise ValueError(f"n_layouts must be at least 1, got {n_layouts}")
+    base_file = load_encoder(base)
+    # All of them before minutes of computing.
+    files = {name: _check(load_encoder(name)) for name in encoders}
+    reference = ExactReference(_check(base_file).encoder.eval(), c, env_id, n_layouts, seed)
+    results = {}
+    for name, file in files.items():
+        results[name] = {"digest": file.digest, **reference.compare(file.encoder.eval()).as_dict()}
+    settings = {"env_id": env_id, "base": base, "base_digest": base_file.digest, "c": c}
+    return {**settings, "n_layouts": n_layouts, "seed": seed, "bins": BINS, "encoders": results}
+
+
+def _check(file: EncoderFile) -> EncoderFile:
+    file.check(gym.make(ENV_IDS[0]).observation_space)
+    return file
+
+
+def table(results: dict[str, Any]) -> str:
+    """The results of :func:`exact` as a Markdown table.
+
+    :param results: what it returned
+    """
+    bins = [f"{low}" if low == high else f"{low}-{high}" for low, high in results["bins"]]
+    header = ["encoder", "map correlation", "state correlation", "profile error", *bins]
+    rows = [header, ["---", *["---:"] * (len(header) - 1)]]
+    for name, result in results["encoders"].items():
+        numbers = [result["map_correlation"], result["state_correlation"], result["profile_error"], *result["profile"]]
+        rows.append([name, *(f"{number:.3f}" for number in numbers)])
+    exact_profile = next(iter(results["encoders"].values()))["exact_profile"]
+    rows.append(["exact metric", "1", "1", "0", *(f"{number:.3f}" for number in exact_profile)])
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("python -m sb3_abisim.analyze", description="What an encoder sees, as numbers.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    command = commands.add_parser("exact", help="hold encoders of Nav2D against the exact metric")
+    command.add_argument("encoders", nargs="+", metavar="ENCODER", help="encoder files or names")
+    command.add_argument("--base", default="Nav2D-v0/ssi", help="base encoder of the metric (default: %(default)s)")
+    command.add_argument("-c", type=float, default=0.9, help="weight of the recursive term (default: %(default)s)")
+    command.add_argument("--env", default=ENV_IDS[0], choices=ENV_IDS)
+    command.add_argument("--n-layouts", type=int, default=10, help="six seconds each (default: %(default)s)")
+    command.add_argument("--seed", type=int, default=HELD_OUT_SEED, help="of the first layout (default: %(default)s)")
+    command.add_argument("-o", "--output", metavar="FILE", help="write the numbers there as JSON")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The command; see ``--help``.
+
+    :param argv: its words; the program's arguments by default
+    """
+    parser = _parser()
+    args = parser.parse_args(argv)
+    try:
+        results = exact(args.encoders, args.base, args.c, args.env, args.n_layouts, args.seed)
+    except (ValueError, FileNotFoundError) as error:
+        parser.error(str(error))
+    print(table(results))
+    if args.output is not None:
+        text = json.dumps(results, indent=1) + "\n"
+        write_atomic(Path(args.output), lambda file: file.write(text.encode()))
+
+
+if __name__ == "__main__":
+    main()
