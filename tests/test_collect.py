@@ -94,7 +94,14 @@ def test_command_killed_at_random_moments_ends_with_the_same_bytes(tmp_path: Pat
 
 def test_ctrl_c_exits_130_with_a_message_and_resumes(tmp_path: Path) -> None:
     arguments = ["--env", "IndexEnv-v0", "-n", "1000000", "-o", str(tmp_path / "d")]
-    process = subprocess.Popen([*COMMAND, *arguments], env=CHILD_ENV, stderr=subprocess.PIPE, text=True)
+    # Where the tests run in the background of a shell, they and their children inherit that Ctrl-C is ignored.
+    process = subprocess.Popen(
+        [*COMMAND, *arguments],
+        env=CHILD_ENV,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     while not (tmp_path / "d" / "shard-00000.json").exists():
         assert process.poll() is None
         time.sleep(0.01)

@@ -7,17 +7,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-import sb3_contrib
 import stable_baselines3 as sb3
 import torch as th
+from extractor_inputs import ALGORITHMS, FRAMES, SPACE, VARIANTS, BatchNormEncoder, Pictures, build, write
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from sb3_abisim import networks
-from sb3_abisim.checkpoint import load_encoder, save_encoder
+from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.extractors import (
     ActionBisimExtractor,
     EncoderExtractor,
@@ -27,94 +27,12 @@ from sb3_abisim.extractors import (
     find_extractors,
     require_weights,
 )
-from sb3_abisim.networks import Encoder, make_encoder
-
-SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
-FRAMES = np.random.default_rng(0).integers(0, 256, (6, 3, 15, 15), np.uint8)
-
-ON_POLICY = {"n_steps": 8}
-PPO_LIKE = {**ON_POLICY, "batch_size": 8}
-OFF_POLICY = {"buffer_size": 200, "learning_starts": 4, "batch_size": 4, "train_freq": 2}
-# A tau that is not a power of two: averaging equal weights by it rounds.
-DQN_LIKE = {**OFF_POLICY, "target_update_interval": 2, "tau": 0.3, "exploration_fraction": 1e-9}
-ALGORITHMS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "PPO": (sb3.PPO, {**PPO_LIKE, "n_epochs": 2}),
-    "A2C": (sb3.A2C, ON_POLICY),
-    "DQN": (sb3.DQN, DQN_LIKE),
-    "SAC": (sb3.SAC, OFF_POLICY),
-    "TD3": (sb3.TD3, {**OFF_POLICY, "policy_delay": 1}),
-    "QRDQN": (sb3_contrib.QRDQN, DQN_LIKE),
-    "TQC": (sb3_contrib.TQC, OFF_POLICY),
-    "TRPO": (sb3_contrib.TRPO, {**PPO_LIKE, "n_critic_updates": 1}),
-    "RecurrentPPO": (sb3_contrib.RecurrentPPO, {**PPO_LIKE, "n_epochs": 1}),
-}
-# Algorithms whose actor and critic may share an extractor, with the value that is not their default.
-SHARING = {"PPO": False, "A2C": False, "TRPO": False, "RecurrentPPO": False, "SAC": True, "TD3": True, "TQC": True}
-VARIANTS = [(name, False) for name in ALGORITHMS] + [(name, True) for name in SHARING]
-
-
-class Pictures(gym.Env[Any, Any]):
-    """Random pictures; the reward depends on picture and action."""
-
-    def __init__(self, continuous: bool = False, channels_last: bool = False) -> None:
-        self.observation_space = spaces.Box(0, 255, (15, 15, 3) if channels_last else (3, 15, 15), np.uint8)
-        self.action_space = spaces.Box(-1, 1, (2,)) if continuous else spaces.Discrete(4)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        return self._draw(), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        picture = self._draw()
-        return (
-            picture,
-            float(picture.flat[0]) / 255 + float(np.sum(action)),
-            bool(self.np_random.random() < 0.2),
-            False,
-            {},
-        )
-
-    def _draw(self) -> Any:
-        return self.np_random.integers(0, 256, self.observation_space.shape, np.uint8)
-
-
-class BatchNormEncoder(Encoder):
-    """A network whose evaluation and training modes differ."""
-
-    observation_shape = (3, 15, 15)
-
-    def __init__(self, width: int = 4) -> None:
-        layers = nn.Sequential(
-            nn.Conv2d(3, width, 3, stride=3), nn.BatchNorm2d(width), nn.ReLU(), nn.Flatten(), nn.Linear(25 * width, 6)
-        )
-        super().__init__(layers, 6, {"width": width})
+from sb3_abisim.networks import make_encoder
 
 
 @pytest.fixture(autouse=True)
 def batch_norm_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(networks.ENCODERS, "BatchNormEncoder", BatchNormEncoder)
-
-
-def write(path: Path, network: str | None = None, objective: str = "abisim", **kwargs: Any) -> Path:
-    """An encoder file with random weights, and for batch norm random statistics far from its initial ones."""
-    th.manual_seed(11)
-    encoder = make_encoder(SPACE, network, **kwargs)
-    for name, buffer in encoder.named_buffers():
-        if "running" in name:
-            buffer.uniform_(0.5, 2.0)
-    save_encoder(
-        path,
-        encoder,
-        observation_space=SPACE,
-        action_space=spaces.Discrete(4),
-        env_id="Nav2D-v0",
-        env_kwargs={},
-        objective=objective,
-        settings={},
-        dataset_digest="0" * 64,
-        golden_observations=FRAMES[:2],
-    )
-    return path
 
 
 @pytest.fixture
@@ -125,23 +43,6 @@ def path(tmp_path: Path) -> Path:
 @pytest.fixture
 def batch_norm_path(tmp_path: Path) -> Path:
     return write(tmp_path / "bn.safetensors", "BatchNormEncoder")
-
-
-def build(name: str, path: Path | str, freeze: bool, other_sharing: bool = False, **kwargs: Any) -> Any:
-    algorithm, settings = ALGORITHMS[name]
-    policy_kwargs: dict[str, Any] = {
-        "features_extractor_class": ActionBisimExtractor,
-        "features_extractor_kwargs": {"encoder": str(path), "freeze": freeze, **kwargs},
-        "net_arch": [8],
-        "optimizer_kwargs": {"weight_decay": 0.1},
-    }
-    if other_sharing:
-        policy_kwargs["share_features_extractor"] = SHARING[name]
-    if name == "RecurrentPPO":
-        policy_kwargs["lstm_hidden_size"] = 8
-    policy = "CnnLstmPolicy" if name == "RecurrentPPO" else "CnnPolicy"
-    env = Pictures(continuous=name in ("SAC", "TD3", "TQC"))
-    return algorithm(policy, env, seed=5, device="cpu", policy_kwargs=policy_kwargs, **settings)
 
 
 def all_extractors(model: BaseAlgorithm) -> list[PretrainedExtractor]:
@@ -414,70 +315,3 @@ def test_vanilla_and_pretrained_have_one_network(path: Path) -> None:
     SSIExtractor(SPACE, str(path))
     # What the policy draws next (its heads) is the same for both.
     assert th.equal(th.rand(3), after_vanilla)
-
-
-def test_wrong_class_for_the_file(tmp_path: Path) -> None:
-    ssi, abisim, other = (str(write(tmp_path / name, objective=name)) for name in ("ssi", "abisim", "other"))
-    SSIExtractor(SPACE, ssi)
-    with pytest.raises(ValueError, match=r"ssi was trained by 'ssi', not 'abisim'; use SSIExtractor"):
-        ActionBisimExtractor(SPACE, ssi)
-    with pytest.raises(ValueError, match="trained by 'abisim', not 'ssi'; use ActionBisimExtractor"):
-        SSIExtractor(SPACE, abisim)
-    with pytest.raises(ValueError, match=r"trained by 'other'.*known objectives are \['abisim', 'ssi'\]"):
-        SSIExtractor(SPACE, other)
-
-
-def test_network_must_be_named_as_the_error_says(batch_norm_path: Path, tmp_path: Path) -> None:
-    wide = str(write(tmp_path / "wide", "BatchNormEncoder", width=5))
-    remedy = {"network": "BatchNormEncoder", "network_kwargs": {"width": 5}}
-    text = r"network='BatchNormEncoder', network_kwargs=\{'width': 5\}"
-    with pytest.raises(ValueError, match=rf"Nav2DEncoder.*{text}"):
-        ActionBisimExtractor(SPACE, wide)
-    with pytest.raises(ValueError, match=rf"'width': 4.*{text}"):
-        ActionBisimExtractor(SPACE, wide, network="BatchNormEncoder")
-    with pytest.raises(ValueError, match=rf"unknown encoder network 'Nonsense'.*{text}"):
-        ActionBisimExtractor(SPACE, wide, network="Nonsense")
-    assert ActionBisimExtractor(SPACE, wide, **remedy).features_dim == 6  # type: ignore[arg-type]
-    # The same is required where the file is absent, so that a mistake is not found out on another machine.
-    assert ActionBisimExtractor(SPACE, "absent", **remedy).n_parameters == 3 * 9 * 5 + 5 + 10 + 125 * 6 + 6  # type: ignore[arg-type]
-
-
-def test_arguments_are_not_changed(path: Path) -> None:
-    kwargs = build("SAC", path, True, network_kwargs={"n_input_channels": 3}).policy_kwargs["features_extractor_kwargs"]
-    assert kwargs == {"encoder": str(path), "freeze": True, "network_kwargs": {"n_input_channels": 3}}
-
-
-def test_damaged_file(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-1] + b"\0\0")
-    with pytest.raises(ValueError, match=f"{path}.*damaged"):
-        build("PPO", path, True)
-
-
-@pytest.mark.parametrize("extractor_class", [ActionBisimExtractor, VanillaExtractor])
-@pytest.mark.parametrize(
-    "space, match",
-    [
-        (spaces.Box(0, 1, (3, 15, 15), np.float32), "uint8 images in 0..255, got Box.*float32"),
-        (spaces.Box(0, 255, (3, 15, 15), np.float32), "uint8 images"),
-        (spaces.Box(0, 1, (3, 15, 15), np.uint8), "uint8 images"),
-        (spaces.Box(0, 255, (675,), np.uint8), "uint8 images"),
-        (spaces.Discrete(3), "uint8 images"),
-        (spaces.Dict({"image": SPACE}), "MultiInputPolicy"),
-        (spaces.Box(0, 255, (12, 15, 15), np.uint8), "12, 15, 15"),
-    ],
-)
-def test_observation_space(path: Path, extractor_class: Any, space: gym.Space[Any], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        extractor_class(space, **({} if extractor_class is VanillaExtractor else {"encoder": str(path)}))
-
-
-def test_normalised_images_are_refused(path: Path) -> None:
-    policy_kwargs = build("PPO", path, True).policy_kwargs
-    vec_env = VecNormalize(DummyVecEnv([Pictures]))
-    with pytest.raises(ValueError, match="norm_obs=False"):
-        sb3.PPO("CnnPolicy", vec_env, policy_kwargs={**policy_kwargs, "normalize_images": False})
-    model = sb3.PPO("CnnPolicy", Pictures(), policy_kwargs={**policy_kwargs, "normalize_images": False}, device="cpu")
-    black = np.zeros_like(FRAMES)
-    model.predict(black)
-    with pytest.raises(ValueError, match=r"reach 255.*remove normalize_images=False"):
-        model.predict(FRAMES)

@@ -1,24 +1,20 @@
-"""The zoo's side: hyperparameters, methods, evaluation splits, and the commands themselves."""
+"""The zoo's side: hyperparameters, methods and evaluation splits. The commands are in test_zoo_commands.py."""
 
 import argparse
 import importlib
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch as th
 import yaml
 from torch import nn
+from zoo_inputs import SMALL, write_encoder
 
 from sb3_abisim import zoo
-from sb3_abisim.checkpoint import load_encoder, save_encoder
+from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.envs import ENV_IDS
-from sb3_abisim.networks import make_encoder
 from sb3_abisim.resources import resource_path
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
@@ -30,28 +26,6 @@ ENTRIES = [
     for env_id in yaml.safe_load(path.read_text())
 ]
 PRETRAINED = [name for name in zoo.EXTRACTORS if name not in zoo.UNTRAINED]
-SMALL = {
-    "ppo": ["n_envs:2", "n_steps:32", "batch_size:32"],
-    "dqn": ["buffer_size:500", "learning_starts:20"],
-    "sac": ["buffer_size:500", "learning_starts:280", "batch_size:8"],
-}
-
-
-def write_encoder(path: Path, env_id: str, objective: str = "abisim") -> str:
-    env = gym.make(env_id)
-    th.manual_seed(len(path.name))
-    return save_encoder(
-        path,
-        make_encoder(env.observation_space),
-        observation_space=env.observation_space,
-        action_space=env.action_space,
-        env_id=env_id,
-        env_kwargs={},
-        objective=objective,
-        settings={},
-        dataset_digest="0" * 64,
-        golden_observations=np.stack([env.reset(seed=seed)[0] for seed in range(2)]),
-    )
 
 
 @pytest.fixture
@@ -281,123 +255,3 @@ def test_enjoy_is_on_unseen_clips() -> None:
     ]
     for name in ("rl_zoo3", "rl_zoo3.utils"):
         assert hasattr(importlib.import_module(name).create_test_env, "__wrapped__")
-
-
-# The commands.
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *argv: str) -> None:
-    monkeypatch.setattr(sys, "argv", [])
-    zoo.main(list(argv))
-
-
-@pytest.mark.parametrize(
-    ("algo", "env_id", "method"),
-    [
-        ("ppo", "Nav2D-v0", "ssi,frozen"),
-        ("ppo", "PointMaze-v0", "vanilla"),
-        ("dqn", "Nav2D-v0", "abisim"),
-        ("sac", "ContinuousPointMaze-v0", "abisim"),
-    ],
-)
-def test_train_and_enjoy(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    algo: str,
-    env_id: str,
-    method: str,
-) -> None:
-    digest, word, encoder = "", method, tmp_path / "mine.safetensors"
-    if method != "vanilla":
-        name, comma, frozen = method.partition(",")
-        digest = write_encoder(encoder, env_id, name)
-        word = f"{name}={encoder}{comma}{frozen}"
-    common = ["--algo", algo, "--env", env_id, "-f", str(tmp_path), "--num-threads", "1"]
-    small = ["--eval-freq", "200", "--eval-episodes", "1", "-params", *SMALL[algo]]
-    run(monkeypatch, "train", *common, "-n", "300", "--seed", "1", "--conf-file", word, *small)
-    out = capsys.readouterr().out
-    state = "frozen" if method.endswith("frozen") else "trained along"
-    # One line for each network with an encoder of its own.
-    assert out.count("Encoder ") == (2 if algo == "sac" else 1)
-    assert f"digest {digest}" in out if digest else "random weights" in out
-    assert state in out and "| encoder/ " in out
-    folder = tmp_path / algo / f"{env_id}_1"
-    evaluations = np.load(folder / "evaluations.npz")
-    assert evaluations["successes"].shape == (1, 1)
-    assert "is_success" in (folder / "0.monitor.csv").read_text().splitlines()[1].split(",")
-    # A run folder is complete in itself: the encoder file may be gone.
-    encoder.unlink(missing_ok=True)
-    run(monkeypatch, "enjoy", *common, "-n", "130", "--no-render")
-    assert "Mean reward" in capsys.readouterr().out
-
-
-def test_a_mistyped_encoder_stops_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    argv = ["train", "--algo", "dqn", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "300", "--eval-freq", "-1"]
-    with pytest.raises(FileNotFoundError, match=r"no encoder file 'tpyo\.safetensors'"):
-        run(monkeypatch, *argv, "--conf-file", "abisim=tpyo.safetensors", "-params", *SMALL["dqn"])
-
-
-def test_optimize_keeps_the_encoder(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    digest = write_encoder(tmp_path / "mine.safetensors", "Nav2D-v0")
-    models: list[Any] = []
-    ppo = exp_manager.ALGOS["ppo"]
-
-    def make(*args: Any, **kwargs: Any) -> Any:
-        models.append(ppo(*args, **kwargs))
-        return models[-1]
-
-    def sample(*_: Any) -> dict[str, Any]:
-        return {"n_steps": 16, "batch_size": 16, "policy_kwargs": {"net_arch": [7], "activation_fn": nn.Tanh}}
-
-    monkeypatch.setitem(exp_manager.ALGOS, "ppo", make)
-    monkeypatch.setitem(exp_manager.HYPERPARAMS_SAMPLER, "ppo", sample)
-    argv = ["train", "--algo", "ppo", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "64", "--no-optim-plots"]
-    argv += ["-optimize", "--n-trials", "2", "--n-evaluations", "1", "--num-threads", "1"]
-    run(monkeypatch, *argv, "--conf-file", f"abisim={tmp_path / 'mine.safetensors'}")
-    assert len(models) == 2
-    for model in models:
-        assert model.policy.features_extractor.digest == digest
-        assert model.policy.mlp_extractor.policy_net[0].out_features == 7
-    assert capsys.readouterr().out.count(digest) == 2
-
-
-def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        zoo.main(["trian", "--algo", "ppo"])
-    assert stopped.value.code == 2 and "train" in capsys.readouterr().err
-
-
-def _python(*argv: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    return subprocess.run([sys.executable, *argv], cwd=cwd, env=environment, capture_output=True, text=True)
-
-
-def test_plain_zoo_command_in_the_checkout(tmp_path: Path) -> None:
-    """Needs the encoders that ship, like test_shipped_encoders."""
-    argv = ["--algo", "ppo", "--env", "DistractorPointMaze-v0", "-f", str(tmp_path), "--num-threads", "1"]
-    small = ["-n", "64", "--eval-freq", "-1", "-params", *SMALL["ppo"]]
-    done = _python("-m", "rl_zoo3.train", *argv, *small, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    assert f"Loading hyperparameters from: {ROOT / 'hyperparams' / 'ppo.yml'}" in done.stdout
-    digest = load_encoder("DistractorPointMaze-v0/abisim").digest
-    assert f"ActionBisimExtractor, source DistractorPointMaze-v0/abisim, digest {digest}" in done.stdout
-    done = _python("-m", "rl_zoo3.enjoy", *argv, "-n", "130", "--no-render", cwd=ROOT)
-    assert done.returncode == 0 and "Mean reward: -" in done.stdout, done.stderr
-
-
-def test_zoo_command_elsewhere(tmp_path: Path) -> None:
-    argv = ["--algo", "ppo", "--env", "Nav2D-v0", "-n", "64", "--eval-freq", "-1"]
-    argv += ["--gym-packages", "sb3_abisim.zoo", "--conf-file", "vanilla", "-params", *SMALL["ppo"]]
-    done = _python("-m", "rl_zoo3.train", *argv, cwd=tmp_path)
-    assert done.returncode == 0 and "Encoder features_extractor: VanillaExtractor" in done.stdout, done.stderr
-
-
-def test_install_from_within_the_import_of_the_zoo() -> None:
-    """Programs that import ExperimentManager first import custom_envs while that module is half done."""
-    code = "from rl_zoo3.exp_manager import ExperimentManager as E; import rl_zoo3.exp_manager as m;"
-    code += "assert E.sb3_abisim_installed and m.ExperimentManager is E"
-    done = _python("-c", code, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
