@@ -6,6 +6,7 @@
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def exact(
     reference = ExactReference(_check(base_file).encoder.eval(), c, env_id, n_layouts, seed)
     results = {}
     for name, file in files.items():
-        results[name] = {"digest": file.digest, **reference.compare(file.encoder.eval()).as_dict()}
+        results[name] = {"digest": file.digest, **asdict(reference.compare(file.encoder.eval()))}
     settings = {"env_id": env_id, "base": base, "base_digest": base_file.digest, "c": c}
     return {**settings, "n_layouts": n_layouts, "seed": seed, "bins": BINS, "encoders": results}
 

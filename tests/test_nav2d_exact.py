@@ -24,6 +24,7 @@ from sb3_abisim.analysis.nav2d_exact import (
     pictures,
     profile,
     reachable,
+    spearman,
 )
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.networks import Nav2DEncoder
@@ -116,7 +117,20 @@ def test_mean_map_and_profile_sort_by_offset():
     assert means[SIZE - 1 + 2, SIZE - 1 - 3] == pytest.approx(197.0)
     assert np.isnan(means[0, 0]), "only one agent sees this offset"
     steps = (np.abs(dy) + np.abs(dx)).astype(float)
-    np.testing.assert_allclose(profile(steps[None])[:4], [1, 2, 3, 4])
+    np.testing.assert_allclose(profile(7 * steps[None])[:4], [1, 2, 3, 4])
+
+
+def test_spearman_by_hand():
+    assert spearman(np.array([1, 2, 3, 4]), np.array([0.0, 1.0, 10.0, 1000.0])) == pytest.approx(1.0)
+    # Ranks 1, 2.5, 2.5 and 1, 3, 2: covariance 1.5 over the root of 1.5 times 2.
+    assert spearman(np.array([0, 5, 5]), np.array([0.0, 9.0, 1.0])) == pytest.approx(1.5 / np.sqrt(1.5 * 2))
+    assert np.isnan(spearman(np.ones(3), np.arange(3)))
+
+
+def test_layouts_have_seeds_of_their_own():
+    layouts = held_out_layouts("Nav2D-v0", 2, seed=8)
+    assert (layouts[0] != layouts[1]).any()
+    np.testing.assert_array_equal(layouts[1], held_out_layouts("Nav2D-v0", 1, seed=9)[0])
 
 
 def test_base_encoder_agrees_with_the_metric_at_c_0(base, few_cells):
@@ -124,6 +138,13 @@ def test_base_encoder_agrees_with_the_metric_at_c_0(base, few_cells):
     assert comparison.map_correlation == pytest.approx(1.0, abs=1e-3)
     assert comparison.state_correlation == pytest.approx(1.0, abs=1e-3)
     assert comparison.profile_error == pytest.approx(0.0, abs=1e-4)
+
+
+def test_short_sighted_encoder_has_a_profile_error(base, few_cells):
+    # The base sees less of what is farther away than its metric does.
+    comparison = ExactReference(base, c=0.9, n_layouts=1).compare(base)
+    assert all(learned <= exact for learned, exact in zip(comparison.profile, comparison.exact_profile, strict=True))
+    assert comparison.profile_error > 0.1
 
 
 def test_untrained_encoder_does_not_agree(base, few_cells):

@@ -134,6 +134,20 @@ def test_error_stays_below_the_tolerance() -> None:
     assert 0 < error <= 1e-3
 
 
+@pytest.mark.parametrize("c", [0.5, 0.9, 0.99])
+def test_enough_steps_where_the_error_shrinks_by_no_more_than_c(c: float) -> None:
+    # Two states that swap, held against one that stays: d_0 = (1 - c) + c d_1 and d_1 = c d_0.
+    base = np.array([[1.0], [0.0]])
+    metric = action_bisim_metric(base, np.array([[1], [0]]), np.array([[0]]), c=c, tol=1e-9)
+    np.testing.assert_allclose(metric, [[1 / (1 + c)], [c / (1 + c)]], atol=1e-9, rtol=0)
+
+
+def test_ends_where_the_tolerance_is_finer_than_the_floats() -> None:
+    metric = action_bisim_metric(BASE.astype(np.float32), THREE, c=0.99, tol=1e-12)
+    np.testing.assert_allclose(metric, action_bisim_metric(BASE, THREE, c=0.99, tol=1e-12), rtol=1e-5)
+    assert metric.dtype == np.float32
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -143,6 +157,7 @@ def test_error_stays_below_the_tolerance() -> None:
         ({"base_distance": np.where(BASE == 5, np.nan, BASE)}, "at least 0"),
         ({"base_distance": BASE.astype(int)}, "int64"),
         ({"transitions": THREE + 1}, "0..n-1"),
+        ({"transitions": THREE - 1}, "0..n-1"),
         ({"transitions": THREE[:2]}, "n = 3"),
         ({"other_transitions": THREE[:, :1]}, "same actions, got 2 and 1"),
         ({"other_transitions": np.eye(3)[THREE]}, "same form"),

@@ -14,7 +14,7 @@ episodes.
 `accuracy`: share of actions told from two consecutive pictures (for continuous actions, the coefficient of
 determination). A blocked move looks like any other blocked move, so 1 cannot be reached. `metric` and `distance`: the
 loss of action-bisimulation (mean squared difference between distance and target, sampling noise of the target
-included) and the mean distance it belongs to.
+included; with `pairs: near` relative to the base distance, as trained) and the mean distance it belongs to.
 
 | encoder | transitions | updates | parameters | features | kB | held-out result |
 |---|---:|---:|---:|---:|---:|---|
