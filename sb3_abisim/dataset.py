@@ -35,6 +35,8 @@ _VERIFIED: set[tuple[str, int, int, str]] = set()
 _HOLDOUT_SEED = 20240229
 
 Part = Literal["train", "test"]
+# Steps between two observations: a number, or the fewest and the most of them.
+Steps = int | tuple[int, int] | list[int]
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class TransitionBatch:
     """B transitions in shuffled order.
 
     :param observations: s_t, uint8 [B, C, H, W], in 0..255
-    :param actions: a_t, int64 [B] or float32 [B, A]
+    :param actions: a_t, int64 [B] or float32 [B, A]; as sequences a_t to a_{t+k-1}, int64 [B, k] or float32 [B, k, A]
     :param next_observations: s_{t+k}, uint8 [B, C, H, W]
     """
 
@@ -121,6 +123,19 @@ class TransitionDataset:
             )
         return starts
 
+    def pairs(self, k: Steps = 1, part: Part | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """All pairs of frames (t, t + steps) of the same episode.
+
+        :param k: steps, at least 1, or the fewest and the most of them
+        :param part: see :meth:`valid_starts`
+        :return: t and steps, each int64 [m]
+        :raises ValueError: if there is none
+        """
+        fewest, most = (k, k) if isinstance(k, int) else k
+        steps = np.arange(fewest, most + 1)
+        starts = [self.valid_starts(int(n), part) for n in steps]
+        return np.concatenate(starts), np.repeat(steps, [len(found) for found in starts])
+
     def frames(self, index: Any) -> NDArray[np.uint8]:
         """Frames at the given indices.
 
@@ -146,35 +161,49 @@ class TransitionDataset:
         return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
 
     def batches(
-        self, batch_size: int, k: int = 1, seed: int = 0, epoch: int = 0, start: int = 0, part: Part | None = None
+        self,
+        batch_size: int,
+        k: Steps = 1,
+        seed: int = 0,
+        epoch: int = 0,
+        start: int = 0,
+        part: Part | None = None,
+        sequences: bool = False,
     ) -> Iterator[TransitionBatch]:
-        """One shuffled pass over all valid starts; the last, incomplete batch is dropped.
+        """One shuffled pass over all :meth:`pairs`; the last, incomplete batch is dropped.
 
         The order is a function of (seed, epoch) alone, so that a position in training is two integers.
 
         :param batch_size: transitions per batch
-        :param k: steps between the two observations
+        :param k: steps between the two observations, or the fewest and the most of them
         :param seed: of the order
         :param epoch: which pass
         :param start: batches to skip
         :param part: see :meth:`valid_starts`
+        :param sequences: whether actions are all k between the two frames, instead of the first
         :raises ValueError: if there are fewer transitions than one batch takes
         """
+        if sequences and not isinstance(k, int):
+            raise ValueError(f"sequences of actions need one length, got k = {k}; give one number")
         if batch_size < 1 or start < 0:
             raise ValueError(f"batch_size must be at least 1 and start at least 0, got {batch_size} and {start}")
-        starts = self.valid_starts(k, part)
+        starts, steps = self.pairs(k, part)
         if len(starts) < batch_size:
             raise ValueError(f"batch_size {batch_size} exceeds the {len(starts)} transitions of {k} steps; lower it")
         # Drawn now and not at the first batch, so that mistakes raise here.
         order = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch]))).permutation(len(starts))
-        return self._iterate(starts[order], batch_size, k, start)
+        return self._iterate(starts[order], steps[order], batch_size, start, sequences)
 
-    def _iterate(self, starts: NDArray[np.int64], batch_size: int, k: int, start: int) -> Iterator[TransitionBatch]:
+    def _iterate(
+        self, starts: NDArray[np.int64], steps: NDArray[np.int64], batch_size: int, start: int, sequences: bool
+    ) -> Iterator[TransitionBatch]:
         for i in range(start, len(starts) // batch_size):
-            index = starts[i * batch_size : (i + 1) * batch_size]
+            here = slice(i * batch_size, (i + 1) * batch_size)
+            index = starts[here]
             # Both frames of a pair lie close together on disk: one gather reads each page once.
-            both = self._gather("frames", np.concatenate([index, index + k]))
-            yield TransitionBatch(both[:batch_size], self._actions[index], both[batch_size:])
+            both = self._gather("frames", np.concatenate([index, index + steps[here]]))
+            taken = index[:, None] + np.arange(steps[0]) if sequences else index
+            yield TransitionBatch(both[:batch_size], self._actions[taken], both[batch_size:])
 
     def _check_index(self, index: Any) -> NDArray[np.int64]:
         array = np.asarray(index)

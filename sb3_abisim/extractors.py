@@ -217,6 +217,30 @@ class SSIExtractor(PretrainedExtractor):
     objective = "ssi"
 
 
+class ACROExtractor(PretrainedExtractor):
+    """Encoder pretrained by k-step inverse dynamics; parameters as for :class:`PretrainedExtractor`."""
+
+    objective = "acro"
+
+
+class BetaVAEExtractor(PretrainedExtractor):
+    """Encoder of a beta-VAE, the mean of its posterior; parameters as for :class:`PretrainedExtractor`."""
+
+    objective = "beta_vae"
+
+
+class CURLExtractor(PretrainedExtractor):
+    """Encoder pretrained by CURL; parameters as for :class:`PretrainedExtractor`."""
+
+    objective = "curl"
+
+
+class InfoNCEExtractor(PretrainedExtractor):
+    """Encoder pretrained by InfoNCE between transitions and actions; parameters as for :class:`PretrainedExtractor`."""
+
+    objective = "info_nce"
+
+
 class ActionBisimExtractor(PretrainedExtractor):
     """Encoder pretrained by action-bisimulation; parameters as for :class:`PretrainedExtractor`."""
 

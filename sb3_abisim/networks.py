@@ -37,6 +37,12 @@ class Encoder(nn.Module):
         """The architecture as JSON: ``make_encoder(space, spec["name"], **spec["kwargs"])`` builds it again."""
         return {"name": type(self).__name__, "kwargs": dict(self._constructor_kwargs)}
 
+    @property
+    def input_shape(self) -> tuple[int, int, int]:
+        """(channels, height, width) of the observations that this network takes."""
+        n_channels = self._constructor_kwargs.get("n_input_channels", self.observation_shape[0])
+        return n_channels, *self.observation_shape[1:]
+
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """Embed images.
 
@@ -138,9 +144,8 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
         encoder = ENCODERS[name](**kwargs)
     except TypeError as error:
         raise ValueError(f"{name} does not take these arguments: {error}") from error
-    expected = (kwargs.get("n_input_channels", 3), *encoder.observation_shape[1:])
-    if shape != expected:
-        raise ValueError(f"{name} takes observations of shape {expected}, got {shape}")
+    if shape != encoder.input_shape:
+        raise ValueError(f"{name} takes observations of shape {encoder.input_shape}, got {shape}")
     return encoder
 
 

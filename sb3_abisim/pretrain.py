@@ -17,7 +17,7 @@ import yaml
 
 from sb3_abisim.pretrain_config import PretrainConfig, load_config
 
-OBJECTIVE_NAMES = ("ssi", "abisim")
+OBJECTIVE_NAMES = ("ssi", "acro", "beta_vae", "curl", "info_nce", "abisim")
 
 
 def pretrain(
@@ -33,7 +33,7 @@ def pretrain(
 ) -> Path:
     """Train an encoder and write its file and card; go on where an interrupted call with the same arguments stopped.
 
-    :param objective: "ssi" or "abisim"
+    :param objective: a name in :data:`OBJECTIVE_NAMES`
     :param data: folder written by :mod:`sb3_abisim.collect`
     :param output: the encoder file, ending in ``.safetensors``; the card is ``.json`` beside it
     :param config: settings; None takes ours for the dataset's environment

@@ -18,7 +18,8 @@ class PretrainConfig:
     :param batch_size: transitions per update
     :param learning_rate: of Adam; a number keeps it constant, ``lin_NUMBER`` lowers it in a straight line to 0, as in
         the zoo's files
-    :param k: steps between the two observations of a transition
+    :param k: steps between the two observations of a transition; ``[fewest, most]`` takes all pairs of observations
+        with a number of steps in this range
     :param holdout: share of the episodes that is only evaluated on, 0 <= holdout < 1
     :param log_interval: updates between two rows of the log
     :param checkpoint_interval: updates between two checkpoints
@@ -30,7 +31,7 @@ class PretrainConfig:
     n_updates: int = 20_000
     batch_size: int = 256
     learning_rate: float | str = 1e-4
-    k: int = 1
+    k: int | list[int] = 1
     holdout: float = 0.05
     log_interval: int = 500
     checkpoint_interval: int = 1_000
@@ -39,10 +40,13 @@ class PretrainConfig:
     objective_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("n_updates", "batch_size", "k", "log_interval", "checkpoint_interval"):
+        for name in ("n_updates", "batch_size", "log_interval", "checkpoint_interval"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if not _is_count(value):
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        bounds = self.k if isinstance(self.k, list) and len(self.k) == 2 else [self.k, self.k]
+        if not all(map(_is_count, bounds)) or bounds[0] > bounds[1]:  # type: ignore[operator]
+            raise ValueError(f"k must be a whole number of at least 1, or [fewest, most], got {self.k!r}")
         if not 0 < self.learning_rate_at(0) < math.inf:
             raise ValueError(f"learning_rate must be a number above 0, got {self.learning_rate!r}")
         if not isinstance(self.holdout, int | float) or not 0 <= self.holdout < 1:
@@ -80,6 +84,10 @@ class PretrainConfig:
         if unknown:
             raise ValueError(f"unknown pretraining setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
         return cls(**mapping)
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
 
 
 def load_config(objective: str, env_id: str, overrides: dict[str, Any] | None = None) -> PretrainConfig:

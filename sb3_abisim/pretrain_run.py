@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.checkpoint import load_encoder, save_encoder
-from sb3_abisim.dataset import TransitionBatch, TransitionDataset
+from sb3_abisim.dataset import Part, TransitionBatch, TransitionDataset
 from sb3_abisim.networks import make_encoder
 from sb3_abisim.objectives import OBJECTIVES, Objective, TensorBatch
 from sb3_abisim.pretrain_config import PretrainConfig
@@ -45,6 +45,10 @@ class PretrainRun:
         self.folder = output.with_suffix(".run")
         self.device = get_device(device)
         objective_kwargs = dict(config.objective_kwargs)
+        objective_class = OBJECTIVES[objective]
+        objective_class.check_k(config.k)
+        if objective_class.reads_action_sequences:
+            objective_kwargs["k"] = config.k
         self.settings: dict[str, Any] = {
             "objective": objective,
             "seed": seed,
@@ -61,7 +65,7 @@ class PretrainRun:
         th.manual_seed(seed)
         encoder = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
         try:
-            module = OBJECTIVES[objective](encoder, dataset.action_space, **objective_kwargs)
+            module = objective_class(encoder, dataset.action_space, **objective_kwargs)
         except TypeError as error:
             raise ValueError(f"objective_kwargs do not fit {objective}: {error}") from error
         # Channels last is the layout in which small convolutions are fastest on CPUs; the numbers are the same.
@@ -105,7 +109,7 @@ class PretrainRun:
     def finish(self) -> None:
         """Write the card and, last, the encoder file; its presence says that the run is over."""
         dataset = self.dataset
-        starts = dataset.valid_starts(self.config.k)
+        starts = dataset.valid_starts()
         golden = dataset.frames(starts[:: max(1, len(starts) // N_GOLDEN)][:N_GOLDEN])
         encoder = self.module.encoder.cpu()
         encoder.standardize(self._sample_observations())
@@ -129,7 +133,7 @@ class PretrainRun:
 
     def _sample_observations(self) -> th.Tensor:
         """Observations from all over the dataset, as floats on the CPU."""
-        starts = self.dataset.valid_starts(self.config.k, part="train")
+        starts = self.dataset.valid_starts(part="train")
         frames = self.dataset.frames(starts[:: max(1, len(starts) // N_STANDARDIZE)][:N_STANDARDIZE])
         observations = preprocess_obs(th.as_tensor(frames), self.dataset.observation_space)
         assert isinstance(observations, th.Tensor)
@@ -217,7 +221,7 @@ class PretrainRun:
     def _batches(self) -> Iterator[TensorBatch]:
         """The batches from the present position to the end; a position is (epoch, batch within it)."""
         config = self.config
-        per_epoch = len(self.dataset.valid_starts(config.k, part="train")) // config.batch_size
+        per_epoch = len(self.dataset.pairs(config.k, "train")[0]) // config.batch_size
         if per_epoch == 0:
             raise ValueError(
                 f"the dataset has too few transitions for a batch of {config.batch_size}; "
@@ -225,11 +229,14 @@ class PretrainRun:
             )
         while self.n_updates < config.n_updates:
             epoch, start = divmod(self.n_updates, per_epoch)
-            batches = self.dataset.batches(config.batch_size, config.k, self.seed, epoch, start, part="train")
-            for batch in batches:
+            for batch in self._pass(config.batch_size, "train", epoch, start):
                 yield self._to_tensors(batch)
                 if self.n_updates >= config.n_updates:
                     return
+
+    def _pass(self, batch_size: int, part: Part, epoch: int = 0, start: int = 0) -> Iterator[TransitionBatch]:
+        sequences = self.module.reads_action_sequences
+        return self.dataset.batches(batch_size, self.config.k, self.seed, epoch, start, part, sequences)
 
     def _to_tensors(self, batch: TransitionBatch) -> TensorBatch:
         """Through SB3's own preprocessing, so that pretraining sees the numbers that RL will see."""
@@ -257,9 +264,8 @@ class PretrainRun:
             return {}
         self.module.eval()
         means: dict[str, float] = {}
-        n_test = len(self.dataset.valid_starts(self.config.k, part="test"))
-        batch_size = min(self.config.batch_size, n_test)
-        batches = self.dataset.batches(batch_size, self.config.k, self.seed, part="test")
+        n_test = len(self.dataset.pairs(self.config.k, "test")[0])
+        batches = self._pass(min(self.config.batch_size, n_test), "test")
         with th.no_grad(), th.random.fork_rng(devices=[]):
             rows = [self.module.loss(self._to_tensors(b))[1] for b in itertools.islice(batches, N_HOLDOUT_BATCHES)]
         for name in rows[0] if rows else ():

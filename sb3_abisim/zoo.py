@@ -34,6 +34,10 @@ from sb3_abisim.resources import resource_path
 EXTRACTORS = {
     "abisim": "ActionBisimExtractor",
     "ssi": "SSIExtractor",
+    "acro": "ACROExtractor",
+    "beta_vae": "BetaVAEExtractor",
+    "curl": "CURLExtractor",
+    "info_nce": "InfoNCEExtractor",
     "vanilla": "VanillaExtractor",
 }
 UNTRAINED = ("vanilla",)

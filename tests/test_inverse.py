@@ -1,43 +1,14 @@
 """Eq. 5 against a loop-written derivation, its gradients, and that it learns what it must."""
 
 import math
+import re
 
 import gymnasium as gym
-import numpy as np
 import pytest
 import torch as th
-from torch import nn
+from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, make_batch
 
-from sb3_abisim.networks import MLP, Encoder
-from sb3_abisim.objectives.base import TensorBatch
-from sb3_abisim.objectives.inverse import InverseDynamics, adaptive_beta, inverse_dynamics_loss
-
-DISCRETE = gym.spaces.Discrete(3)
-CONTINUOUS = gym.spaces.Box(-1, 1, (2,), np.float32)
-
-
-class LineEncoder(Encoder):
-    """Vectors instead of images, for speed."""
-
-    observation_shape = (1, 1, 4)
-
-    def __init__(self, features_dim: int = 5) -> None:
-        super().__init__(nn.Sequential(nn.Flatten(), MLP(4, 16, features_dim)), features_dim, {})
-
-
-def make_batch(action_space, n=256, seed=0, noise=0.0):
-    """s is random, s' is s moved by the action along its first numbers; the other numbers are drawn anew."""
-    generator = th.Generator().manual_seed(seed)
-    s = th.rand(n, 1, 1, 4, generator=generator)
-    s_next = s.clone()
-    s_next[..., 2:] = th.rand(n, 1, 1, 2, generator=generator)
-    if isinstance(action_space, gym.spaces.Discrete):
-        actions = th.randint(0, 3, (n,), generator=generator)
-        s_next[:, 0, 0, 0] += 0.2 * (actions - 1)
-    else:
-        actions = 2 * th.rand(n, 2, generator=generator) - 1
-        s_next[:, 0, 0, :2] += 0.2 * actions
-    return TensorBatch(s, actions, s_next)
+from sb3_abisim.objectives.inverse import ACRO, InverseDynamics, adaptive_beta, inverse_dynamics_loss
 
 
 def test_loss_equals_loop():
@@ -100,17 +71,6 @@ def test_gradients_reach_encoder_and_head():
     assert all(float(p.grad.abs().sum()) > 0 for p in objective.parameters())
 
 
-def fit(objective, batch, n_updates=250):
-    optimizer = th.optim.Adam(objective.parameters(), lr=5e-3)
-    for _ in range(n_updates):
-        loss, _ = objective.loss(batch)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        objective.after_step()
-    return objective.eval()
-
-
 @pytest.mark.parametrize("space", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
 def test_learns_the_action_on_unseen_transitions(space):
     th.manual_seed(0)
@@ -157,3 +117,20 @@ def test_refuses_bad_settings(kwargs):
 def test_refuses_other_action_spaces():
     with pytest.raises(ValueError, match="MultiBinary"):
         InverseDynamics(LineEncoder(), gym.spaces.MultiBinary(3))
+
+
+def test_acro_is_the_same_loss_for_several_steps():
+    th.manual_seed(0)
+    acro = ACRO(LineEncoder(), DISCRETE, l1_penalty=0.3)
+    ssi = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.3)
+    ssi.load_state_dict(acro.state_dict())
+    batch = make_batch(DISCRETE)
+    assert float(acro.loss(batch)[0].detach()) == float(ssi.loss(batch)[0].detach())
+    for k in (2, [1, 5], [2, 2]):
+        ACRO.check_k(k)
+        with pytest.raises(ValueError, match=re.escape(f"ssi takes single steps, got k = {k}")):
+            InverseDynamics.check_k(k)
+    InverseDynamics.check_k(1)
+    for k in (1, [1, 1]):
+        with pytest.raises(ValueError, match="which is ssi"):
+            ACRO.check_k(k)

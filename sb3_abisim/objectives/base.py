@@ -15,7 +15,8 @@ class TensorBatch:
     """Transitions (s_t, a_t, s_{t+k}) on a device, observations already through SB3's ``preprocess_obs``.
 
     :param observations: float (batch, channels, height, width) in 0..1
-    :param actions: a_t, int64 (batch,) for ``Discrete``, float32 (batch, action_dim) for ``Box``
+    :param actions: a_t, int64 (batch,) for ``Discrete``, float32 (batch, action_dim) for ``Box``; with a second
+        dimension k where an objective reads a_t to a_{t+k-1}
     :param next_observations: s_{t+k}, as ``observations``
     """
 
@@ -35,6 +36,8 @@ class Objective(nn.Module):
     """
 
     name: ClassVar[str]
+    # Whether batches must hold all k actions between the two observations; the constructor then takes k.
+    reads_action_sequences: ClassVar[bool] = False
 
     def __init__(self, encoder: Encoder, action_space: gym.Space[Any]) -> None:
         super().__init__()
@@ -44,6 +47,16 @@ class Objective(nn.Module):
             raise ValueError(f"actions must be Discrete starting at 0 or a one-dimensional Box, got {action_space}")
         self.encoder = encoder
         self.action_space = action_space
+
+    @classmethod
+    def check_k(cls, k: int | list[int]) -> None:
+        """Refuse transitions over a number of steps that this objective is not made for.
+
+        :param k: steps between the two observations, or the fewest and the most of them
+        :raises ValueError: naming the remedy
+        """
+        if k != 1:
+            raise ValueError(f"{cls.name} takes single steps, got k = {k}; set k to 1, or use acro or info_nce")
 
     @property
     def n_actions(self) -> int | None:
@@ -59,7 +72,7 @@ class Objective(nn.Module):
         """Actions as network inputs.
 
         :param actions: as in :class:`TensorBatch`
-        :return: float32 (batch, action_dim)
+        :return: float32 (batch, action_dim), or (batch, k, action_dim)
         """
         if self.n_actions is None:
             return actions

@@ -111,3 +111,22 @@ class InverseDynamics(Objective):
         log_prob = th.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=1)  # type: ignore[no-untyped-call]
         unexplained = (mean - actions).pow(2).sum() / (actions - actions.mean(dim=0)).pow(2).sum()
         return log_prob, (1.0 - unexplained).clamp(0.0, 1.0).detach()
+
+
+class ACRO(InverseDynamics):
+    """The same for k > 1 (ACRO, Lamb et al.): which action was the first of k steps from s_t to s_{t+k}.
+
+    The number of steps is not given to the inverse model, as in the paper.
+    """
+
+    name = "acro"
+
+    @classmethod
+    def check_k(cls, k: int | list[int]) -> None:
+        """Refuse single steps, which are SSI.
+
+        :param k: steps between the two observations, or the fewest and the most of them
+        :raises ValueError: for k = 1
+        """
+        if k in (1, [1, 1]):
+            raise ValueError("acro needs k > 1, got k = 1, which is ssi")

@@ -1,0 +1,47 @@
+"""What the tests of the objectives share: a small encoder, transitions on a line, a training loop."""
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.objectives.base import Objective, TensorBatch
+
+DISCRETE = gym.spaces.Discrete(3)
+CONTINUOUS = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+
+class LineEncoder(Encoder):
+    """Vectors instead of images, for speed."""
+
+    observation_shape = (1, 1, 4)
+
+    def __init__(self, features_dim: int = 5) -> None:
+        super().__init__(nn.Sequential(nn.Flatten(), MLP(4, 16, features_dim)), features_dim, {})
+
+
+def make_batch(action_space, n=256, seed=0, noise=0.0):
+    """s is random, s' is s moved by the action along its first numbers; the other numbers are drawn anew."""
+    generator = th.Generator().manual_seed(seed)
+    s = th.rand(n, 1, 1, 4, generator=generator)
+    s_next = s.clone()
+    s_next[..., 2:] = th.rand(n, 1, 1, 2, generator=generator)
+    if isinstance(action_space, gym.spaces.Discrete):
+        actions = th.randint(0, 3, (n,), generator=generator)
+        s_next[:, 0, 0, 0] += 0.2 * (actions - 1)
+    else:
+        actions = 2 * th.rand(n, 2, generator=generator) - 1
+        s_next[:, 0, 0, :2] += 0.2 * actions
+    return TensorBatch(s, actions, s_next)
+
+
+def fit(objective: Objective, batch: TensorBatch, n_updates: int = 250) -> Objective:
+    optimizer = th.optim.Adam(objective.parameters(), lr=5e-3)
+    for _ in range(n_updates):
+        loss, _ = objective.loss(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        objective.after_step()
+    return objective.eval()
