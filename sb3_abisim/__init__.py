@@ -13,19 +13,35 @@ from sb3_abisim._version import __version__
 if TYPE_CHECKING:
     from sb3_abisim.checkpoint import load_encoder, save_encoder
     from sb3_abisim.dataset import TransitionDataset
-    from sb3_abisim.extractors import ActionBisimExtractor, SSIExtractor, VanillaExtractor
+    from sb3_abisim.extractors import (
+        ACROExtractor,
+        ActionBisimExtractor,
+        BetaVAEExtractor,
+        CURLExtractor,
+        InfoNCEExtractor,
+        SSIExtractor,
+        VanillaExtractor,
+    )
 
 _LAZY = {
     "load_encoder": "checkpoint",
     "save_encoder": "checkpoint",
     "TransitionDataset": "dataset",
+    "ACROExtractor": "extractors",
     "ActionBisimExtractor": "extractors",
+    "BetaVAEExtractor": "extractors",
+    "CURLExtractor": "extractors",
+    "InfoNCEExtractor": "extractors",
     "SSIExtractor": "extractors",
     "VanillaExtractor": "extractors",
 }
 
 __all__ = [
+    "ACROExtractor",
     "ActionBisimExtractor",
+    "BetaVAEExtractor",
+    "CURLExtractor",
+    "InfoNCEExtractor",
     "SSIExtractor",
     "TransitionDataset",
     "VanillaExtractor",

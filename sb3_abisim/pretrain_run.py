@@ -236,7 +236,8 @@ class PretrainRun:
 
     def _pass(self, batch_size: int, part: Part, epoch: int = 0, start: int = 0) -> Iterator[TransitionBatch]:
         sequences = self.module.reads_action_sequences
-        return self.dataset.batches(batch_size, self.config.k, self.seed, epoch, start, part, sequences)
+        k = self.config.k
+        return self.dataset.batches(batch_size, k, self.seed, epoch, start, part=part, sequences=sequences)
 
     def _to_tensors(self, batch: TransitionBatch) -> TensorBatch:
         """Through SB3's own preprocessing, so that pretraining sees the numbers that RL will see."""

@@ -119,6 +119,36 @@ def test_pairs_never_cross_an_episode(dataset: TransitionDataset, k: int) -> Non
     assert pairs == len(dataset.valid_starts(k)) // 7 * 7
 
 
+def test_pairs_of_a_range_of_steps_are_all_of_them_once(dataset: TransitionDataset) -> None:
+    ends = dataset.ends
+    expected = [(t, k) for k in (2, 3, 4) for t in range(dataset.n_frames - k) if not ends[t : t + k].any()]
+    starts, steps = dataset.pairs((2, 4))
+    assert list(zip(starts.tolist(), steps.tolist(), strict=True)) == expected
+    parts = [dataset.pairs([2, 4], part) for part in ("train", "test")]
+    assert sorted(zip(*np.concatenate(parts, axis=1).tolist(), strict=True)) == sorted(expected)
+    visited = []
+    for batch in dataset.batches(1, k=(2, 4)):
+        (now,), (later,) = labels(batch.observations), labels(batch.next_observations)
+        assert now[1] == later[1]
+        visited.append((int(now[0]), int(now[1]), int(later[0] - now[0])))
+    seen = labels(dataset.frames(starts))
+    assert sorted(visited) == sorted((*pair, k) for pair, k in zip(seen[:, :2].tolist(), steps.tolist(), strict=True))
+
+
+def test_sequences_hold_every_action_in_between(dataset: TransitionDataset) -> None:
+    n_batches = 0
+    for batch in dataset.batches(5, k=3, sequences=True):
+        assert batch.actions.shape == (5, 3)
+        # The last action is the one that led to the later picture.
+        assert (labels(batch.next_observations)[:, 2] == batch.actions[:, 2]).all()
+        n_batches += 1
+    assert n_batches == len(dataset.valid_starts(3)) // 5
+    plain = next(dataset.batches(5, k=3))
+    assert (next(dataset.batches(5, k=3, sequences=True)).actions[:, 0] == plain.actions).all()
+    with pytest.raises(ValueError, match=r"one length, got k = \(1, 2\)"):
+        dataset.batches(5, k=(1, 2), sequences=True)
+
+
 def test_too_large_k_names_the_longest_segment(dataset: TransitionDataset) -> None:
     with pytest.raises(ValueError, match=rf"k = {index_env.LIMIT + 1} .* longest has {index_env.LIMIT}"):
         dataset.valid_starts(index_env.LIMIT + 1)

@@ -11,8 +11,11 @@ from extractor_inputs import FRAMES, SPACE, BatchNormEncoder, Pictures, build, w
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_abisim import networks
-from sb3_abisim.extractors import ActionBisimExtractor, SSIExtractor, VanillaExtractor
+import sb3_abisim
+from sb3_abisim import networks, zoo
+from sb3_abisim.extractors import ActionBisimExtractor, PretrainedExtractor, VanillaExtractor
+from sb3_abisim.objectives import OBJECTIVES
+from sb3_abisim.pretrain import OBJECTIVE_NAMES
 
 
 @pytest.fixture(autouse=True)
@@ -30,15 +33,29 @@ def batch_norm_path(tmp_path: Path) -> Path:
     return write(tmp_path / "bn.safetensors", "BatchNormEncoder")
 
 
-def test_wrong_class_for_the_file(tmp_path: Path) -> None:
-    ssi, abisim, other = (str(write(tmp_path / name, objective=name)) for name in ("ssi", "abisim", "other"))
-    SSIExtractor(SPACE, ssi)
-    with pytest.raises(ValueError, match=r"ssi was trained by 'ssi', not 'abisim'; use SSIExtractor"):
-        ActionBisimExtractor(SPACE, ssi)
-    with pytest.raises(ValueError, match="trained by 'abisim', not 'ssi'; use ActionBisimExtractor"):
-        SSIExtractor(SPACE, abisim)
-    with pytest.raises(ValueError, match=r"trained by 'other'.*known objectives are \['abisim', 'ssi'\]"):
-        SSIExtractor(SPACE, other)
+EXTRACTORS = {cls.objective: cls for cls in PretrainedExtractor.__subclasses__()}
+
+
+def test_every_objective_has_an_extractor() -> None:
+    assert set(EXTRACTORS) == set(OBJECTIVES) == set(OBJECTIVE_NAMES)
+    assert {cls.__name__ for cls in EXTRACTORS.values()} | {"VanillaExtractor"} == set(zoo.EXTRACTORS.values())
+    assert all(getattr(sb3_abisim, name) for name in zoo.EXTRACTORS.values())
+
+
+@pytest.mark.parametrize("objective", EXTRACTORS)
+def test_wrong_class_for_the_file(tmp_path: Path, objective: str) -> None:
+    file = str(write(tmp_path / objective, objective=objective))
+    right = EXTRACTORS[objective]
+    assert right(SPACE, file).contract["objective"] == objective  # type: ignore[index]
+    for wrong in set(EXTRACTORS.values()) - {right}:
+        text = f"{objective} was trained by '{objective}', not '{wrong.objective}'; use {right.__name__}"
+        with pytest.raises(ValueError, match=text):
+            wrong(SPACE, file)
+
+
+def test_file_of_an_unknown_objective(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"trained by 'other'.*known objectives are \['abisim', 'acro'.*'ssi'\]"):
+        ActionBisimExtractor(SPACE, str(write(tmp_path / "other", objective="other")))
 
 
 def test_network_must_be_named_as_the_error_says(batch_norm_path: Path, tmp_path: Path) -> None:

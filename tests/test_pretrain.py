@@ -68,12 +68,40 @@ def test_abisim_trains_its_base_first(data, tmp_path, monkeypatch):
     assert contract["settings"]["base_digest"] == base.digest
 
 
+def test_abisim_takes_every_base(data, tmp_path):
+    for objective, k in (("acro", 3), ("acro", [1, 4]), ("info_nce", 1), ("info_nce", 2)):
+        base = run(data, tmp_path / f"{objective}{k}.safetensors", objective, k=k)
+        config = load_config("abisim", "Nav2D-v0", SETTINGS)
+        output = tmp_path / f"abisim_{objective}{k}.safetensors"
+        pretrain("abisim", data, output, config, base=str(base), device="cpu", progress_bar=False, verbose=0)
+        settings = load_encoder(str(output)).contract["settings"]
+        assert settings["base_objective"] == objective
+        assert settings["base_digest"] == load_encoder(str(base)).digest
+
+
+@pytest.mark.parametrize(
+    ("objective", "k", "message"),
+    [("ssi", 2, "use acro"), ("acro", 1, "which is ssi"), ("info_nce", [1, 2], "one length"), ("curl", 3, "single")],
+)
+def test_refuses_steps_that_the_objective_is_not_made_for(data, tmp_path, objective, k, message):
+    with pytest.raises(ValueError, match=message):
+        run(data, tmp_path / "x.safetensors", objective, k=k)
+
+
+@pytest.mark.parametrize("k", [0, 1.5, True, [2, 1], [0, 3], [1, 2, 3], "5"], ids=str)
+def test_refuses_k_that_is_no_number_of_steps(k):
+    with pytest.raises(ValueError, match="k must be a whole number"):
+        PretrainConfig(k=k)
+
+
 class Interrupted(Exception):
     pass
 
 
-@pytest.mark.parametrize("objective", ["ssi", "abisim"])
-@pytest.mark.parametrize("stop_at", [3, 12, 29])
+@pytest.mark.parametrize(
+    ("objective", "stop_at"),
+    [("ssi", 3), ("ssi", 29), ("acro", 12), ("beta_vae", 12), ("curl", 12), ("info_nce", 12), ("abisim", 12)],
+)
 def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, objective, stop_at):
     kwargs = {}
     base = str(run(data, tmp_path / "base.safetensors"))

@@ -88,7 +88,7 @@ def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: 
     for word, class_name, expected in [
         ("abisim", "ActionBisimExtractor", {"encoder": shipped}),
         ("abisim,frozen", "ActionBisimExtractor", {"encoder": shipped, "freeze": True}),
-        ("ssi", "SSIExtractor", {"encoder": shipped.replace("/abisim", "/ssi")}),
+        *((name, zoo.EXTRACTORS[name], {"encoder": shipped.replace("/abisim", f"/{name}")}) for name in PRETRAINED),
         ("ssi=my runs/x.safetensors", "SSIExtractor", {"encoder": "my runs/x.safetensors"}),
         ("vanilla", "VanillaExtractor", None),
     ]:
@@ -181,7 +181,9 @@ def test_mistakes_are_refused(manager: Any) -> None:
         manager("a2c", "Nav2D-v0").read_hyperparameters()
     with pytest.raises(ValueError, match=r"no hyperparameters of sac for PointMaze-v0, only of: ppo"):
         manager("sac", "PointMaze-v0", "ssi").read_hyperparameters()
-    with pytest.raises(ValueError, match=r"'abisin' is no YAML.*one of abisim, ssi, vanilla"):
+    with pytest.raises(
+        ValueError, match=r"'abisin' is no YAML.*one of abisim, ssi, acro, beta_vae, curl, info_nce, vanilla"
+    ):
         manager("ppo", "Nav2D-v0", "abisin").read_hyperparameters()
     with pytest.raises(ValueError, match="give one of the two"):
         manager("ppo", "Nav2D-v0", "ssi", hyperparams={"policy_kwargs": "dict()"}).read_hyperparameters()

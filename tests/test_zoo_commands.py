@@ -31,6 +31,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *argv: str) -> None:
         ("ppo", "Nav2D-v0", "ssi,frozen"),
         ("ppo", "PointMaze-v0", "vanilla"),
         ("dqn", "Nav2D-v0", "abisim"),
+        ("ppo", "ContinuousDistractorPointMaze-v0", "beta_vae"),
         ("sac", "ContinuousPointMaze-v0", "abisim"),
     ],
 )
