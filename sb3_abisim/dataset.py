@@ -1,8 +1,10 @@
 """Reads datasets: memory-mapped transitions (s_t, a_t, s_{t+k}) that never cross an episode's end.
 
-Nothing that grows with the pictures is loaded; per frame, the reader keeps 5 bytes plus the size of an action.
+Nothing that grows with the pictures is loaded; per frame, the reader keeps 5 bytes plus the size of an action. Pages of
+the files that were read count as this process's memory until they are given back, which happens now and then.
 """
 
+import mmap
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -31,6 +33,9 @@ from sb3_abisim.dataset_format import (
 VERIFY_BELOW_BYTES = 4 * 10**9
 # Files whose hash this process has found right: (path, size, time of the last change, sha256).
 _VERIFIED: set[tuple[str, int, int, str]] = set()
+# Bytes read between two times at which the mapped pages are given back. They stay in the system's cache while there is
+# room, so that reading them again is cheap.
+RELEASE_AFTER_BYTES = 256 * 2**20
 # Which segments are held out is a property of the dataset, not of a run.
 _HOLDOUT_SEED = 20240229
 
@@ -82,7 +87,8 @@ class TransitionDataset:
         frames_per_shard = [shard["n_frames"] for shard in self.meta["shards"]]
         # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
         self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
-        self._maps: dict[tuple[str, int], NDArray[Any]] = {}
+        self._maps: dict[tuple[str, int], np.memmap[Any, Any]] = {}
+        self._bytes_read = 0
         n_shards = len(frames_per_shard)
         self._actions = np.concatenate([self._shard("actions", k) for k in range(n_shards)])
         self._ends = np.concatenate([self._shard("ends", k) for k in range(n_shards)])
@@ -223,7 +229,17 @@ class TransitionDataset:
         for shard in np.flatnonzero(np.diff(bounds)):
             here = slice(bounds[shard], bounds[shard + 1])
             out[order[here]] = self._shard(name, int(shard))[ascending[here] - self._offsets[shard]]
+        self._bytes_read += out.nbytes
+        if self._bytes_read > RELEASE_AFTER_BYTES:
+            self._release_pages()
         return out
+
+    def _release_pages(self) -> None:
+        self._bytes_read = 0
+        # Not on every platform.
+        if hasattr(mmap, "MADV_DONTNEED"):
+            for array in self._maps.values():
+                array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
     def _shard(self, name: str, shard: int) -> NDArray[Any]:
         """One array of a shard, memory-mapped at its first use."""
@@ -231,14 +247,15 @@ class TransitionDataset:
             path = self.path / array_file(name, shard)
             dtype, row_shape = array_layout(self.meta, name)
             try:
-                array = np.load(path, mmap_mode="r", allow_pickle=False).view(np.ndarray)
+                array = np.load(path, mmap_mode="r", allow_pickle=False)
             except ValueError as error:
                 raise DatasetError(f"{path} is not an array file of ours: {error}") from None
             expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
             if array.dtype != dtype or array.shape != expected:
                 raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
             self._maps[name, shard] = array
-        return self._maps[name, shard]
+        # Indexing a plain array is faster than indexing its memory-mapped subclass.
+        return self._maps[name, shard].view(np.ndarray)
 
     def _make_remaining(self) -> NDArray[np.int32]:
         """Steps from each frame to the last of its segment."""

@@ -149,6 +149,20 @@ def test_sequences_hold_every_action_in_between(dataset: TransitionDataset) -> N
         dataset.batches(5, k=(1, 2), sequences=True)
 
 
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="reads Linux's account of mapped pages")
+@pytest.mark.parametrize(("limit", "stays"), [(10**12, True), (0, False)], ids=["kept", "given back"])
+def test_pages_that_were_read_are_given_back(
+    dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch, limit: int, stays: bool
+) -> None:
+    monkeypatch.setattr(dataset_module, "RELEASE_AFTER_BYTES", limit)
+    frames = dataset.frames(np.arange(dataset.n_frames))
+    lines = Path("/proc/self/smaps").read_text().splitlines()
+    maps = [i for i, line in enumerate(lines) if "frames-00000.npy" in line and str(dataset.path) in line]
+    resident = [int(line.split()[1]) for i in maps for line in lines[i : i + 6] if line.startswith("Rss:")]
+    assert len(resident) > 0 and (sum(resident) > 0) == stays
+    np.testing.assert_array_equal(dataset.frames(np.arange(dataset.n_frames)), frames)
+
+
 def test_too_large_k_names_the_longest_segment(dataset: TransitionDataset) -> None:
     with pytest.raises(ValueError, match=rf"k = {index_env.LIMIT + 1} .* longest has {index_env.LIMIT}"):
         dataset.valid_starts(index_env.LIMIT + 1)
