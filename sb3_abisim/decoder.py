@@ -5,14 +5,15 @@ import math
 import torch as th
 from torch import nn
 
-HIDDEN_CHANNELS = 32
+# Channels of the smallest map; each doubling of the side halves them, down to the least.
+MOST_CHANNELS, LEAST_CHANNELS = 32, 8
 # Side of the smallest map, at most.
 SMALLEST = 8
 
 
 class Decoder(nn.Module):
-    """Embeddings to pictures of any size: a linear layer to a small map, then nearest-neighbour upsampling and 3x3
-    convolutions, doubling the side until it is that of the picture.
+    """Embeddings to pictures of any size: a linear layer to a small map, then 3x3 convolutions and
+    nearest-neighbour upsampling, doubling the side until it is that of the picture.
 
     The paper gives no decoder. Upsampling, unlike transposed convolutions, reaches odd sides such as 15 exactly.
 
@@ -25,11 +26,12 @@ class Decoder(nn.Module):
         n_channels, height, width = shape
         n_doublings = max(0, math.ceil(math.log2(max(height, width) / SMALLEST)))
         sizes = [(math.ceil(height / 2**i), math.ceil(width / 2**i)) for i in range(n_doublings, -1, -1)]
-        smallest = (HIDDEN_CHANNELS, *sizes[0])
+        widths = [max(LEAST_CHANNELS, MOST_CHANNELS // 2**i) for i in range(n_doublings + 1)]
+        smallest = (MOST_CHANNELS, *sizes[0])
         layers: list[nn.Module] = [nn.Linear(features_dim, math.prod(smallest)), nn.Unflatten(1, smallest), nn.ReLU()]
-        for size in sizes[1:]:
-            layers += [nn.Upsample(size), nn.Conv2d(HIDDEN_CHANNELS, HIDDEN_CHANNELS, 3, padding=1), nn.ReLU()]
-        self.layers = nn.Sequential(*layers, nn.Conv2d(HIDDEN_CHANNELS, n_channels, 3, padding=1))
+        for i, size in enumerate(sizes[1:]):
+            layers += [nn.Conv2d(widths[i], widths[i + 1], 3, padding=1), nn.ReLU(), nn.Upsample(size)]
+        self.layers = nn.Sequential(*layers, nn.Conv2d(widths[-1], n_channels, 3, padding=1))
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """Pictures, as logits of intensities in 0..1.

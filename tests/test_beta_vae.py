@@ -61,6 +61,7 @@ def test_reconstructs_unseen_pictures_and_not_under_a_large_penalty():
     assert error[100.0] > 0.8 * variance, "a posterior equal to the prior says nothing"
 
 
+@th.no_grad()
 def test_an_embedding_of_its_pictures_serves_the_next_observations_not_at_all():
     objective, batch = BetaVAE(LineEncoder(), DISCRETE), make_batch(DISCRETE, 4)
     th.manual_seed(1)
