@@ -66,13 +66,18 @@ def pretrain(
         raise ValueError(f"a base encoder belongs to 'abisim' alone, got base={base!r} for {objective!r}")
     folder = output.with_suffix(".run")
     folder.mkdir(parents=True, exist_ok=True)
-    with folder_lock(folder):
-        run = PretrainRun(objective, dataset, output, config, base, seed, device)
-        if run.is_finished():
-            if verbose:
-                print(f"{output} is finished already; nothing to do")
-            return output
-        run.train(progress_bar, verbose)
+    try:
+        with folder_lock(folder):
+            run = PretrainRun(objective, dataset, output, config, base, seed, device)
+            if run.is_finished():
+                if verbose:
+                    print(f"{output} is finished already; nothing to do")
+                return output
+            run.train(progress_bar, verbose)
+    finally:
+        # What was refused at once leaves no empty folder behind.
+        if not any(folder.iterdir()):
+            folder.rmdir()
     return output
 
 

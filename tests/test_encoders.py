@@ -6,19 +6,25 @@ import json
 import pytest
 
 from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.pretrain import OBJECTIVE_NAMES
 from sb3_abisim.pretrain_config import load_config
 from sb3_abisim.resources import resource_path
 
 FILES = sorted(resource_path("encoders").glob("*/*.safetensors"))
 
 
-def test_there_are_some():
-    assert {path.parent.name for path in FILES} == {
-        "Nav2D-v0",
-        "PointMaze-v0",
-        "ContinuousPointMaze-v0",
-        "DistractorPointMaze-v0",
-    }
+ENV_IDS = (
+    "Nav2D-v0",
+    "PointMaze-v0",
+    "ContinuousPointMaze-v0",
+    "DistractorPointMaze-v0",
+    "ContinuousDistractorPointMaze-v0",
+)
+
+
+def test_every_objective_for_every_environment():
+    found = {(path.parent.name, path.stem) for path in FILES}
+    assert found == {(env_id, name) for env_id in ENV_IDS for name in OBJECTIVE_NAMES}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")

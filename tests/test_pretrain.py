@@ -86,6 +86,7 @@ def test_abisim_takes_every_base(data, tmp_path):
 def test_refuses_steps_that_the_objective_is_not_made_for(data, tmp_path, objective, k, message):
     with pytest.raises(ValueError, match=message):
         run(data, tmp_path / "x.safetensors", objective, k=k)
+    assert not list(tmp_path.iterdir()), "a refused run leaves nothing behind"
 
 
 @pytest.mark.parametrize("k", [0, 1.5, True, [2, 1], [0, 3], [1, 2, 3], "5"], ids=str)

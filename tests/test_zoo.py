@@ -155,9 +155,7 @@ def test_shipped_encoders() -> None:
             contract = load_encoder(f"{folder}/{method}").contract
             assert (contract["env_id"], contract["objective"]) == (folder, method)
             env = gym.make(env_id)
-            # Continuous Distractor PointMaze borrows the encoder of the discrete one, which shows the same pictures.
-            action_space = None if env_id == "ContinuousDistractorPointMaze-v0" else env.action_space
-            load_encoder(f"{folder}/{method}").check(env.observation_space, action_space)
+            load_encoder(f"{folder}/{method}").check(env.observation_space, env.action_space)
 
 
 def test_other_environments_are_untouched(manager: Any) -> None:
