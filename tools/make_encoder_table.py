@@ -11,13 +11,13 @@ each file (`.json`) holds the commands that made it, the digest of its data, all
 made of the cards by `tools/make_encoder_table.py`; its numbers are those of the last row of the log, on held-out
 episodes.
 
-* `accuracy` of `ssi` and `acro`: share of actions told from two pictures one or k steps apart (for continuous actions, the
-  coefficient of determination). A blocked move looks like any other blocked move, so 1 cannot be reached.
+* `accuracy` of `ssi` and `acro`: share of actions told from two pictures one or k steps apart (for continuous actions,
+  the coefficient of determination). A blocked move looks like any other blocked move, so 1 cannot be reached.
 * `accuracy` of `info_nce`: share of actions ranked first, among all four or, continuous, among those of a batch of 256.
 * `accuracy` of `curl`: share of keys found in a batch of 256.
 * `squared_error` of `beta_vae`: of the reconstruction, per intensity in 0..1; `kl` is in nats per picture.
-* `metric` and `distance` of `abisim`: the loss (mean squared difference between distance and target, sampling noise of the
-  target included; with `pairs: near` relative to the base distance, as trained) and the mean distance it belongs to.
+* `metric` and `distance` of `abisim`: the loss (mean squared difference between distance and target, sampling noise of
+  the target included; with `pairs: near` relative to the base distance, as trained), the mean distance it belongs to.
 
 | encoder | transitions | updates | parameters | features | kB | held-out result |
 |---|---:|---:|---:|---:|---:|---|

@@ -1,0 +1,198 @@
+"""Speed of pretraining beside a straightforward PyTorch loop on the same network, loss, batch size and data.
+
+The straightforward loop is a ``torch.utils.data.Dataset`` that indexes one transition after the other and makes it
+float32, a ``DataLoader`` that shuffles and stacks them, pictures channels first, and Adam. Both loops run in turns
+within one process, on one core, and the speed of each is that of its fastest turn. ``python -m
+benchmarks.bench_pretrain --data DIR...``, with datasets of sb3_abisim.collect.
+"""
+
+import argparse
+import os
+import platform
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results" / "pretrain.md"
+BATCH_SIZE = 256
+OBJECTIVES = ("ssi", "abisim")
+
+
+def straightforward(run: Any) -> Iterator[float]:
+    """One update after another of a plain loop over the run's data; yields the loss."""
+    import numpy as np
+    import torch as th
+
+    from sb3_abisim.objectives import TensorBatch
+
+    dataset = run.dataset
+    shards = [np.load(path, mmap_mode="r") for path in sorted(dataset.path.glob("frames-*.npy"))]
+    offsets = np.cumsum([0] + [len(shard) for shard in shards])
+    starts = dataset.valid_starts(part="train")
+    actions = dataset.actions(np.arange(dataset.n_frames))
+
+    class Transitions(th.utils.data.Dataset[Any]):
+        def __len__(self) -> int:
+            return len(starts)
+
+        def __getitem__(self, i: int) -> Any:
+            t = starts[i]
+            shard = int(np.searchsorted(offsets, t, side="right")) - 1
+            now, later = (shards[shard][t - offsets[shard] + k] for k in (0, 1))
+            frames = (th.from_numpy(frame.astype(np.float32)) / 255.0 for frame in (now, later))
+            return *frames, th.as_tensor(actions[t])
+
+    module = run.module.to(memory_format=th.contiguous_format)
+    module.train()
+    optimizer = th.optim.Adam([p for p in module.parameters() if p.requires_grad], lr=1e-3)
+    while True:
+        for now, later, taken in th.utils.data.DataLoader(Transitions(), BATCH_SIZE, shuffle=True, drop_last=True):
+            loss, _ = module.loss(TensorBatch(now, taken, later))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            module.after_step()
+            yield float(loss.detach())
+
+
+def ours(run: Any) -> Iterator[float]:
+    """The same by :mod:`sb3_abisim.pretrain_run`."""
+    for batch in run._batches():
+        yield float(run._update(batch)["loss"])
+
+
+def make_run(objective: str, data: Path, base: str | None, folder: Path) -> Any:
+    """A pretraining run that has not begun."""
+    from sb3_abisim.dataset import TransitionDataset
+    from sb3_abisim.pretrain_config import load_config
+    from sb3_abisim.pretrain_run import PretrainRun
+
+    dataset = TransitionDataset(data, verify=False)
+    config = load_config(objective, dataset.env_id, {"batch_size": BATCH_SIZE, "n_updates": 10**6})
+    return PretrainRun(objective, dataset, folder / "x.safetensors", config, base, seed=0, device="cpu")
+
+
+def fastest_turns(loops: dict[str, Iterator[float]], rounds: int, n_updates: int) -> dict[str, float]:
+    """Transitions per second of the fastest turn of each loop."""
+    best = dict.fromkeys(loops, 0.0)
+    for loop in loops.values():
+        next(loop)
+    for _ in range(rounds):
+        for name, loop in loops.items():
+            start = time.perf_counter()
+            for _ in range(n_updates):
+                next(loop)
+            best[name] = max(best[name], n_updates * BATCH_SIZE / (time.perf_counter() - start))
+    return best
+
+
+def matmul_rate() -> float:
+    """GFLOP/s of a float32 product of two 1024 x 1024 matrices, fastest of ten."""
+    import torch as th
+
+    a = th.rand(1024, 1024)
+    times = []
+    for _ in range(10):
+        start = time.perf_counter()
+        a @ a
+        times.append(time.perf_counter() - start)
+    return 2 * 1024**3 / min(times) / 1e9
+
+
+def flops_per_update(run: Any) -> int:
+    """Floating-point operations of one update, as torch counts them (convolutions and products)."""
+    from torch.utils.flop_counter import FlopCounterMode
+
+    with FlopCounterMode(display=False) as counter:
+        next(ours(run))
+    return int(counter.get_total_flops())
+
+
+def shares(run: Any, n_updates: int) -> dict[str, float]:
+    """Share of the time of our loop by phase."""
+    import torch as th
+
+    seconds = {"data": 0.0, "loss": 0.0, "gradients": 0.0, "optimizer and checks": 0.0}
+    plain_loss, plain_backward = run.module.loss, th.Tensor.backward
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            result = function(*args, **kwargs)
+            seconds[name] += time.perf_counter() - start
+            return result
+
+        return call
+
+    run.module.loss, th.Tensor.backward = timed("loss", plain_loss), timed("gradients", plain_backward)  # type: ignore[method-assign]
+    try:
+        batches, begin = run._batches(), time.perf_counter()
+        for _ in range(n_updates):
+            start = time.perf_counter()
+            batch = next(batches)
+            seconds["data"] += time.perf_counter() - start
+            run._update(batch)
+        total = time.perf_counter() - begin
+    finally:
+        run.module.loss, th.Tensor.backward = plain_loss, plain_backward  # type: ignore[method-assign]
+    seconds["optimizer and checks"] = total - sum(seconds.values())
+    return {name: value / total for name, value in seconds.items()}
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure and write the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_pretrain", description=__doc__)
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="datasets of sb3_abisim.collect")
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="Markdown file (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=8, help="turns of each loop (default: %(default)s)")
+    parser.add_argument("--updates", type=int, default=6, help="updates per turn (default: %(default)s)")
+    args = parser.parse_args(argv)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    rows, notes = [], []
+    for data in args.data:
+        for objective in OBJECTIVES:
+            with tempfile.TemporaryDirectory() as folder:
+                runs = [make_run(objective, data, _base(objective, data), Path(folder)) for _ in range(3)]
+                loops = {"plain": straightforward(runs[0]), "ours": ours(runs[1])}
+                speed = fastest_turns(loops, args.rounds, args.updates)
+                flops = flops_per_update(runs[2]) * speed["ours"] / BATCH_SIZE / 1e9
+                parts = ", ".join(f"{name} {share:.0%}" for name, share in shares(runs[2], 2 * args.updates).items())
+            label = f"`{objective}`, {runs[0].dataset.env_id}"
+            ratio = speed["ours"] / speed["plain"]
+            rows.append(f"| {label} | {speed['plain']:,.0f} | {speed['ours']:,.0f} | {ratio:.1f} | {flops:.0f} |")
+            notes.append(f"* {label}: {parts}")
+            print(rows[-1], notes[-1], flush=True)
+    text = "\n".join(
+        [
+            "# Speed of pretraining",
+            "",
+            f"`python -m benchmarks.bench_pretrain` on one core of {platform.machine()}, batches of {BATCH_SIZE}: "
+            f"transitions per second in the fastest of {args.rounds} turns of {args.updates} updates. A product of two "
+            f"1024 x 1024 matrices reaches {matmul_rate():.0f} GFLOP/s on this core.",
+            "",
+            "| objective, environment | straightforward | ours | ratio | ours, GFLOP/s |",
+            "|---|---:|---:|---:|---:|",
+            *rows,
+            "",
+            "Where our time goes:",
+            "",
+            *notes,
+            "",
+        ]
+    )
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    args.output.write_text(text)
+
+
+def _base(objective: str, data: Path) -> str | None:
+    from sb3_abisim.pretrain import read_env_id
+
+    return f"{read_env_id(data)}/ssi" if objective == "abisim" else None
+
+
+if __name__ == "__main__":
+    main()
