@@ -22,6 +22,7 @@ if TYPE_CHECKING:
         SSIExtractor,
         VanillaExtractor,
     )
+    from sb3_abisim.optimizers import EncoderLRAdam
 
 _LAZY = {
     "load_encoder": "checkpoint",
@@ -34,6 +35,7 @@ _LAZY = {
     "InfoNCEExtractor": "extractors",
     "SSIExtractor": "extractors",
     "VanillaExtractor": "extractors",
+    "EncoderLRAdam": "optimizers",
 }
 
 __all__ = [
@@ -41,6 +43,7 @@ __all__ = [
     "ActionBisimExtractor",
     "BetaVAEExtractor",
     "CURLExtractor",
+    "EncoderLRAdam",
     "InfoNCEExtractor",
     "SSIExtractor",
     "TransitionDataset",

@@ -23,6 +23,7 @@ from torch import nn
 
 from sb3_abisim.checkpoint import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.networks import Encoder, make_encoder
+from sb3_abisim.optimizers import mark_encoder
 
 
 class EncoderExtractor(BaseFeaturesExtractor):
@@ -41,6 +42,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
     def __init__(self, observation_space: gym.Space[Any], encoder: Encoder) -> None:
         super().__init__(observation_space, encoder.features_dim)
         self.encoder = encoder
+        mark_encoder(encoder)
         self._weight_names = [name for name, _ in encoder.named_parameters()]
         self.register_buffer("initial_weights", self._flat_weights().clone())
         self._input_checked = False
