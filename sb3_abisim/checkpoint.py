@@ -153,7 +153,7 @@ def save_encoder(
     if broken:
         raise ValueError(f"weights are not finite, the encoder is not saved: {broken}")
     tensors["golden.observations"] = golden
-    tensors["golden.embeddings"] = _embed(on_cpu, observation_space, golden)
+    tensors["golden.embeddings"] = embed(on_cpu, observation_space, golden)
     data, digest = _serialize(tensors, text)
     write_atomic(path, lambda file: file.write(data))
     return digest
@@ -195,8 +195,23 @@ def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:
         raise EncoderFileError(f"{path} is not a valid encoder file ({error!r}); {_REMEDY}") from error
-    _check_golden(path, _embed(encoder, space, golden), expected)
+    _check_golden(path, embed(encoder, space, golden), expected)
     return EncoderFile(path, digest, encoder, contract)
+
+
+def embed(encoder: Encoder, space: gym.Space[Any], frames: th.Tensor) -> th.Tensor:
+    """Embed uint8 frames through the preprocessing that SB3 puts before a features extractor, without gradients.
+
+    :param encoder: the network, on the device of the frames
+    :param space: the space of one frame
+    :param frames: uint8 (batch, channels, height, width)
+    :return: float32 (batch, features_dim)
+    """
+    observations = preprocess_obs(frames, space)
+    assert isinstance(observations, th.Tensor)
+    with th.no_grad():
+        embeddings: th.Tensor = encoder(observations)
+        return embeddings.float().contiguous()
 
 
 def resolve_encoder(name: str | os.PathLike[str]) -> Path:
@@ -232,15 +247,6 @@ def _describe(observation_space: gym.Space[Any]) -> dict[str, Any]:
 def _versions() -> dict[str, str]:
     packages = ("torch", "stable_baselines3", "gymnasium", "safetensors", "numpy")
     return {"sb3_abisim": __version__, **{package: version(package) for package in packages}}
-
-
-def _embed(encoder: Encoder, space: gym.Space[Any], frames: th.Tensor) -> th.Tensor:
-    """Embeddings of uint8 frames, through the preprocessing that SB3 puts before a features extractor."""
-    observations = preprocess_obs(frames, space)
-    assert isinstance(observations, th.Tensor)
-    with th.no_grad():
-        embeddings: th.Tensor = encoder(observations)
-        return embeddings.float().contiguous()
 
 
 def _serialize(tensors: dict[str, th.Tensor], text: str) -> tuple[bytes, str]:

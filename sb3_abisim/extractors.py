@@ -158,7 +158,7 @@ class PretrainedExtractor(EncoderExtractor):
         except EncoderNotFoundError as error:
             absence = str(error)
         if file is not None:
-            _check_objective(file, self.objective)
+            check_objective(file, self.objective)
             file.check(observation_space)
         module = _build_network(observation_space, network, network_kwargs or {}, file)
         super().__init__(observation_space, module)
@@ -287,12 +287,38 @@ def _check_space(observation_space: gym.Space[Any]) -> None:
         )
 
 
-def _check_objective(file: EncoderFile, objective: str) -> None:
+def extractor_class(objective: str) -> type[PretrainedExtractor]:
+    """The extractor for encoders that an objective has trained.
+
+    :param objective: as in the encoder file's contract, e.g. "ssi"
+    :raises ValueError: for an objective without one
+    """
+    classes = _extractor_classes()
+    if objective not in classes:
+        raise ValueError(f"no extractor for objective {objective!r}; known objectives are {sorted(classes)}")
+    return classes[objective]
+
+
+def check_objective(file: EncoderFile, objective: str) -> None:
+    """Refuse an encoder that another objective has trained.
+
+    :param file: the encoder file
+    :param objective: short name of the objective that is expected, e.g. "ssi"
+    :raises ValueError: with both sides
+    """
     trained_by = file.contract["objective"]
     if trained_by != objective:
-        classes = {cls.objective: cls.__name__ for cls in PretrainedExtractor.__subclasses__()}
-        remedy = f"use {classes[trained_by]}" if trained_by in classes else f"known objectives are {sorted(classes)}"
+        classes = _extractor_classes()
+        remedy = (
+            f"use {classes[trained_by].__name__}"
+            if trained_by in classes
+            else f"known objectives are {sorted(classes)}"
+        )
         raise ValueError(f"{file.path} was trained by {trained_by!r}, not {objective!r}; {remedy}")
+
+
+def _extractor_classes() -> dict[str, type[PretrainedExtractor]]:
+    return {cls.objective: cls for cls in PretrainedExtractor.__subclasses__()}
 
 
 def _build_network(

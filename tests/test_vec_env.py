@@ -1,0 +1,159 @@
+"""Embeddings instead of pictures: each is the encoder's, and what Stable-Baselines3 stores is the right one."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import stable_baselines3 as sb3
+import torch as th
+from extractor_inputs import SPACE, BatchNormEncoder, Pictures, write
+from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, unwrap_vec_wrapper
+
+from sb3_abisim import networks
+from sb3_abisim.checkpoint import EncoderNotFoundError, load_encoder
+from sb3_abisim.vec_env import EncodedBox, VecEncodeObservations
+
+
+class Counter(gym.Env[Any, Any]):
+    """Each picture is new: its three channels are all the number of pictures so far. Episodes last 3 and 5 steps."""
+
+    observation_space = SPACE
+    action_space = spaces.Discrete(4)
+
+    def __init__(self, length: int, render_mode: str | None = None) -> None:
+        self.length, self.shown, self.steps, self.render_mode = length, 0, 0, render_mode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._show(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return self._show(), float(self.shown), False, self.steps == self.length, {}
+
+    def render(self) -> Any:
+        return np.full((4, 4, 3), self.shown, np.uint8)
+
+    def _show(self) -> Any:
+        self.shown += 1
+        return np.full(SPACE.shape, self.shown, np.uint8)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return write(tmp_path / "e.safetensors")
+
+
+def counters(**kwargs: Any) -> DummyVecEnv:
+    return DummyVecEnv([lambda length=length: Monitor(Counter(length, **kwargs)) for length in (3, 5)])
+
+
+def embedding(path: Path, *shown: int) -> Any:
+    """Derived from the network alone, one picture at a time."""
+    encoder = load_encoder(path).encoder
+    with th.no_grad():
+        pictures = [th.full((1, *SPACE.shape), number, dtype=th.uint8).float() / 255 for number in shown]
+        return th.cat([encoder(picture) for picture in pictures]).numpy()
+
+
+def test_every_observation_is_embedded(path: Path) -> None:
+    plain, env = counters(), VecEncodeObservations(counters(), str(path), device="cpu")
+    assert env.observation_space.shape == (576,) and env.observation_space.dtype == np.float32
+    assert env.action_space == plain.action_space
+    pictures, embeddings = plain.reset(), env.reset()
+    ended = 0
+    for _ in range(16):
+        assert embeddings.dtype == np.float32 and embeddings.shape == (2, 576)
+        shown = [int(picture[0, 0, 0]) for picture in pictures]
+        assert np.allclose(embeddings, embedding(path, *shown), atol=1e-5)
+        pictures, rewards, dones, infos = plain.step(np.zeros(2, int))
+        embeddings, own_rewards, own_dones, own_infos = env.step(np.zeros(2, int))
+        assert np.array_equal(rewards, own_rewards) and np.array_equal(dones, own_dones)
+        for info, own in zip(infos, own_infos, strict=True):
+            assert info.keys() == own.keys() and info["TimeLimit.truncated"] == own["TimeLimit.truncated"]
+            if "terminal_observation" in info:
+                ended += 1
+                terminal = embedding(path, int(info["terminal_observation"][0, 0, 0]))[0]
+                assert np.allclose(own["terminal_observation"], terminal, atol=1e-5)
+                assert own["terminal_observation"].shape == (576,)
+    assert ended == 8
+    # The encoder's numbers tell pictures apart far better than the tolerance.
+    assert np.abs(embedding(path, 1) - embedding(path, 2)).max() > 1e-3
+
+
+def test_batch_norm_is_in_evaluation_mode(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(networks.ENCODERS, "BatchNormEncoder", BatchNormEncoder)
+    path = write(tmp_path / "bn.safetensors", "BatchNormEncoder")
+    env = VecEncodeObservations(counters(), str(path), device="cpu")
+    assert np.allclose(env.reset(), embedding(path, 1, 1), atol=1e-5)
+    assert not any(p.requires_grad for p in env._encoder.parameters())
+
+
+def test_replay_buffer_holds_terminal_embeddings(path: Path) -> None:
+    """next_obs at an episode's end is its last picture, not the first one of the next episode."""
+    env = VecEncodeObservations(counters(), str(path), device="cpu")
+    model = sb3.DQN("MlpPolicy", env, buffer_size=20, learning_starts=100, device="cpu")
+    model.learn(12)
+    buffer = model.replay_buffer
+    assert buffer.observations.dtype == np.float32 and buffer.observations.shape[2:] == (576,)
+    # The first environment's fourth and fifth pictures are the end of one episode and the start of the next.
+    assert np.allclose(buffer.observations[:4, 0], embedding(path, 1, 2, 3, 5), atol=1e-5)
+    assert np.allclose(buffer.next_observations[:4, 0], embedding(path, 2, 3, 4, 6), atol=1e-5)
+
+
+def test_what_other_wrappers_need(path: Path) -> None:
+    env = VecEncodeObservations(counters(render_mode="rgb_array"), str(path), device="cpu")
+    assert env.seed(3) == [3, 4]
+    env.reset()
+    assert env.get_attr("length") == [3, 5] and env.env_method("get_wrapper_attr", "shown") == [1, 1]
+    env.set_attr("mark", 7)
+    assert env.get_attr("mark", indices=1) == [7]
+    assert env.env_is_wrapped(Monitor) == [True, True]
+    picture = env.render()
+    assert picture is not None and picture.shape == (8, 4, 3) and (picture == 1).all()
+    normalized = VecNormalize(env, norm_obs=False)
+    found = unwrap_vec_wrapper(normalized, VecEncodeObservations)
+    assert found is env and env.n_parameters == sum(p.numel() for p in networks.make_encoder(SPACE).parameters())
+    assert np.allclose(normalized.reset(), embedding(path, 2, 2), atol=1e-5)
+    normalized.close()
+
+
+def test_channels_last(path: Path) -> None:
+    last = DummyVecEnv([lambda: Pictures(channels_last=True)])
+    with pytest.raises(ValueError, match=r"\[3, 15, 15\].*\[15, 15, 3\]"):
+        VecEncodeObservations(last, str(path))
+    last.seed(4)
+    transposed = VecEncodeObservations(VecTransposeImage(last), str(path), device="cpu")
+    plain = DummyVecEnv([lambda: Pictures(channels_last=True)])
+    plain.seed(4)
+    picture = th.from_numpy(plain.reset().transpose(0, 3, 1, 2)).float() / 255
+    with th.no_grad():
+        assert np.allclose(transposed.reset(), load_encoder(path).encoder(picture).numpy(), atol=1e-5)
+
+
+def test_refusals(path: Path, tmp_path: Path) -> None:
+    with pytest.raises(EncoderNotFoundError, match=r"searched .*mistyped\.safetensors"):
+        VecEncodeObservations(counters(), str(tmp_path / "mistyped.safetensors"))
+    with pytest.raises(ValueError, match="was trained by 'abisim', not 'ssi'; use ActionBisimExtractor"):
+        VecEncodeObservations(counters(), str(path), objective="ssi")
+    VecEncodeObservations(counters(), str(path), objective="abisim")
+    with pytest.raises(ValueError, match=r"was pretrained on Nav2D-v0.*but is to be used with"):
+        VecEncodeObservations(DummyVecEnv([lambda: gym.make("CartPole-v1")]), str(path))
+
+
+def test_a_model_is_not_continued_on_another_encoder(path: Path, tmp_path: Path) -> None:
+    other = write(tmp_path / "other.safetensors", objective="ssi")
+    model = sb3.A2C("MlpPolicy", VecEncodeObservations(counters(), str(path)), device="cpu")
+    model.save(tmp_path / "model.zip")
+    again = sb3.A2C.load(tmp_path / "model.zip", env=VecEncodeObservations(counters(), str(path)), device="cpu")
+    assert isinstance(again.observation_space, EncodedBox)
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        sb3.A2C.load(tmp_path / "model.zip", env=VecEncodeObservations(counters(), str(other)), device="cpu")
+    assert EncodedBox(3, "ab") == EncodedBox(3, "ab") != EncodedBox(4, "ab")
+    assert EncodedBox(3, "ab") != spaces.Box(-np.inf, np.inf, (3,), np.float32)
+    assert repr(EncodedBox(3, "ab")) == "EncodedBox(3, digest='ab')"
