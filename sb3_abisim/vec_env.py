@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_abisim.checkpoint import embed, load_encoder
 from sb3_abisim.extractors import check_objective
+from sb3_abisim.networks import Encoder
 
 
 class EncodedBox(spaces.Box):
@@ -71,7 +72,9 @@ class VecEncodeObservations(VecEnvWrapper):
         self.encoder_file = file
         self.source = encoder
         self._device = get_device(device)
-        self._encoder = file.encoder.to(self._device).requires_grad_(False)
+        # Channels last: small convolutions on a CPU are a quarter faster.
+        encoder = file.encoder.to(self._device, memory_format=th.channels_last)  # type: ignore[call-overload]
+        self._encoder: Encoder = encoder.requires_grad_(False)
 
     @property
     def n_parameters(self) -> int:
@@ -84,7 +87,7 @@ class VecEncodeObservations(VecEnvWrapper):
         :param frames: uint8 (batch, channels, height, width)
         :return: float32 (batch, features_dim)
         """
-        tensor = th.from_numpy(frames).to(self._device)
+        tensor = th.from_numpy(frames).to(self._device, memory_format=th.channels_last)
         embeddings: NDArray[np.float32] = embed(self._encoder, self.venv.observation_space, tensor).cpu().numpy()
         return embeddings
 

@@ -1,0 +1,100 @@
+"""A batch behind ``DummyVecEnv``: nothing differs but the speed."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.lockstep import LockstepVecEnv
+
+
+def make(env_id: str, cls: Any, n_envs: int = 3, **kwargs: Any) -> Any:
+    return make_vec_env(env_id, n_envs, seed=7, vec_env_cls=cls, **kwargs)
+
+
+def same(ours: Any, theirs: Any) -> bool:
+    """Equal infos, pictures included; clocks are not compared."""
+    if isinstance(theirs, dict):
+        return ours.keys() == theirs.keys() and all(same(ours[key], theirs[key]) for key in theirs if key != "t")
+    return type(ours) is type(theirs) and np.array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_equals_dummy(env_id: str, tmp_path: Path) -> None:
+    kwargs = {"monitor_kwargs": {"info_keywords": ("is_success",)}}
+    ours, theirs = (
+        make(env_id, cls, monitor_dir=str(tmp_path / cls.__name__), **kwargs) for cls in (LockstepVecEnv, DummyVecEnv)
+    )
+    assert np.array_equal(ours.reset(), theirs.reset())
+    ours.action_space.seed(0)
+    ended = 0
+    for step in range(170):
+        if step == 120:
+            assert np.array_equal(ours.reset(), theirs.reset())
+        if step == 140:
+            for env in (ours, theirs):
+                env.seed(99)
+            assert np.array_equal(ours.reset(), theirs.reset())
+        actions = np.array([ours.action_space.sample() for _ in range(3)])
+        (*arrays, infos), (*their_arrays, their_infos) = ours.step(actions), theirs.step(actions)
+        for array, other in zip(arrays, their_arrays, strict=True):
+            assert array.dtype == other.dtype and np.array_equal(array, other)
+        assert all(same(info, other) for info, other in zip(infos, their_infos, strict=True))
+        ended += sum(arrays[2])
+    if env_id.startswith("Nav2D"):
+        assert ended > 3
+    factors, their_factors = ours.env_method("factors"), theirs.env_method("factors")
+    assert all(same(one, other) for one, other in zip(factors, their_factors, strict=True))
+    assert len({one["agent"].tobytes() for one in factors}) > 1
+    if "Distractor" in env_id:
+        assert ours.get_attr("fingerprint") == theirs.get_attr("fingerprint")
+    for env in (ours, theirs):
+        env.close()
+    if ended:
+        files = [sorted((tmp_path / name).glob("*")) for name in ("LockstepVecEnv", "DummyVecEnv")]
+        assert [file.name for file in files[0]] == [file.name for file in files[1]]
+        for file, other in zip(*files, strict=True):
+            episodes = [[line.split(",")[::3] for line in f.read_text().splitlines()[2:]] for f in (file, other)]
+            assert episodes[0] == episodes[1]
+
+
+def test_arguments_and_pictures_reach_the_batch() -> None:
+    kwargs = {"env_kwargs": {"layout": "corridor", "render_mode": "rgb_array"}}
+    ours, theirs = (make("Nav2D-v0", cls, **kwargs) for cls in (LockstepVecEnv, DummyVecEnv))
+    assert np.array_equal(ours.reset(), theirs.reset())
+    assert np.array_equal(ours.render(), theirs.render())
+    assert ours.env_is_wrapped(Monitor) == [True] * 3
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValueError, match=r"not made by gymnasium\.make of an id of sb3_abisim; use DummyVecEnv"):
+        make("CartPole-v1", LockstepVecEnv)
+    with pytest.raises(ValueError, match="must be made alike"):
+        LockstepVecEnv([lambda: gym.make("Nav2D-v0"), lambda: gym.make("PointMaze-v0")])
+    env = make("Nav2D-v0", LockstepVecEnv)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) before step"):
+        env.step(np.zeros(3, int))
+    env.reset()
+    with pytest.raises(ValueError, match="outside"):
+        env.step(np.full(3, 9))
+    with pytest.raises(ValueError, match="knows no reset options"):
+        env.set_options({"maze": 3})
+        env.reset()
+
+
+class Mirrored(gym.ActionWrapper[Any, Any, Any]):
+    def action(self, action: Any) -> Any:
+        return 3 - action
+
+
+def test_wrappers_that_change_actions_are_noticed() -> None:
+    env = make("Nav2D-v0", LockstepVecEnv, wrapper_class=Mirrored)
+    env.reset()
+    with pytest.raises(ValueError, match="use DummyVecEnv with wrappers that change actions"):
+        env.step(np.zeros(3, int))
