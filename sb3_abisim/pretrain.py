@@ -96,7 +96,12 @@ def read_env_id(data: Path) -> str:
         raise ValueError(f"{meta_path} was not written by sb3_abisim.collect ({error!r}); give its folder") from error
 
 
-def _parse_overrides(words: list[str]) -> dict[str, Any]:
+def parse_overrides(words: list[str]) -> dict[str, Any]:
+    """Read ``name:value`` words as settings for :func:`~sb3_abisim.pretrain_config.load_config`.
+
+    :param words: values in YAML, or numbers such as 1e-4
+    :raises ValueError: for a word without a colon
+    """
     overrides = {}
     for word in words:
         name, colon, value = word.partition(":")
@@ -137,7 +142,7 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     data = Path(args.data)
     try:
-        config = load_config(args.objective, args.env, _parse_overrides(args.params))
+        config = load_config(args.objective, args.env, parse_overrides(args.params))
         env_id = read_env_id(data)
         if env_id != args.env:
             raise ValueError(f"{data} was collected in {env_id}, not in {args.env}")

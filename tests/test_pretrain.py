@@ -296,11 +296,11 @@ def test_command_line_mistakes_exit_2(data, tmp_path, capsys, arguments, message
 
 def test_numbers_without_a_dot(data, tmp_path):
     """YAML 1.1 takes 1e-4 for a text, users of the zoo do not."""
-    from sb3_abisim.pretrain import _parse_overrides
+    from sb3_abisim.pretrain import parse_overrides
 
     words = ["learning_rate:1e-4", "objective_kwargs.l1_penalty:2e-3", "learning_rate:lin_1e-3"]
-    assert _parse_overrides(words[:2]) == {"learning_rate": 1e-4, "objective_kwargs.l1_penalty": 2e-3}
-    assert _parse_overrides(words[2:]) == {"learning_rate": "lin_1e-3"}
+    assert parse_overrides(words[:2]) == {"learning_rate": 1e-4, "objective_kwargs.l1_penalty": 2e-3}
+    assert parse_overrides(words[2:]) == {"learning_rate": "lin_1e-3"}
 
 
 def test_folder_of_someone_else(tmp_path, capsys):

@@ -1,0 +1,167 @@
+"""Run one cell: ``python -m sb3_abisim.benchmark.cell`` with the cell as a line of JSON on standard input.
+
+An engine starts this program, here or on another machine. It holds standard input open: when the engine dies, however
+it dies, the input ends and the command is killed with all that it started, so that no orphan goes on writing.
+"""
+
+import json
+import os
+import platform
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import sb3_abisim
+from sb3_abisim._version import __version__
+from sb3_abisim.atomic import FolderLockedError, file_digest, folder_lock, write_atomic
+
+# A worker that was lost may take this long to die and to let go of its cell.
+LOCK_PATIENCE_SECONDS = 60.0
+LOG_TAIL_LINES = 15
+
+
+def marker_path(root: Path, name: str) -> Path:
+    """The file that says that a cell is done, and how it came about.
+
+    :param root: the benchmark's folder
+    :param name: of the cell
+    """
+    return root / "cells" / f"{name}.json"
+
+
+def is_done(root: Path, cell: dict[str, Any]) -> bool:
+    """Whether the output is there and still what was made.
+
+    :param root: the benchmark's folder
+    :param cell: what :meth:`~sb3_abisim.benchmark.graph.Cell.to_json` gave
+    """
+    try:
+        marker = json.loads(marker_path(root, cell["name"]).read_bytes())
+        return bool(marker["digest"] == file_digest(root / cell["output"] / cell["proof"]))
+    except FileNotFoundError:
+        return False
+
+
+class CellError(RuntimeError):
+    """A cell's command failed; the message ends with the last lines of its log."""
+
+
+def launch(root: Path, cell: dict[str, Any], threads: int, started: Any = None) -> None:
+    """Run a cell in a program of its own and wait for its end.
+
+    :param root: the benchmark's folder
+    :param cell: what :meth:`~sb3_abisim.benchmark.graph.Cell.to_json` gave
+    :param threads: for the command's libraries
+    :param started: called with the process, so that it can be stopped
+    :raises CellError: when it failed
+    """
+    log = root / "logs" / f"{cell['name']}.log"
+    log.parent.mkdir(exist_ok=True)
+    package = str(Path(sb3_abisim.__file__).resolve().parent.parent)
+    path = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    environment = {**os.environ, **dict.fromkeys(names, str(threads)), "PYTHONPATH": path}
+    with open(log, "ab") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sb3_abisim.benchmark.cell"],
+            cwd=root, env=environment, stdin=subprocess.PIPE, stdout=file, stderr=file, start_new_session=True,
+        )  # fmt: skip
+    if started is not None:
+        started(process)
+    assert process.stdin is not None
+    try:
+        process.stdin.write(json.dumps(cell).encode() + b"\n")
+        process.stdin.flush()
+    except BrokenPipeError:
+        pass  # it has died already; its status says so
+    try:
+        code = process.wait()
+    except BaseException:
+        kill(process)
+        raise
+    process.stdin.close()
+    if code:
+        kill(process)
+        tail = "\n  ".join(log.read_text(errors="replace").splitlines()[-LOG_TAIL_LINES:])
+        raise CellError(f"{cell['title']} failed (exit status {code}); {log} ends with\n  {tail}")
+
+
+def kill(process: "subprocess.Popen[bytes]") -> None:
+    """End a program that :func:`launch` started, and all that it started.
+
+    :param process: as given to ``started``
+    """
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except (ProcessLookupError, PermissionError):
+        pass
+    process.wait()
+
+
+def main() -> None:
+    """Run the cell that standard input names, in the working directory, which is the benchmark's folder."""
+    cell = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_die_with_engine, daemon=True).start()
+    root = Path.cwd()
+    work = root / "work" / cell["name"]
+    work.mkdir(parents=True, exist_ok=True)
+    deadline = time.monotonic() + LOCK_PATIENCE_SECONDS
+    while True:
+        try:
+            with folder_lock(work):
+                _run(root, work, cell)
+            break
+        except FolderLockedError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.5)
+    shutil.rmtree(work, ignore_errors=True)
+
+
+def _die_with_engine() -> None:
+    while sys.stdin.buffer.read1():
+        pass
+    os.killpg(os.getpgrp(), signal.SIGKILL)
+
+
+def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
+    if is_done(root, cell):
+        return  # by a worker that was thought lost
+    output = root / cell["output"]
+    output.parent.mkdir(parents=True, exist_ok=True)
+    if cell["kind"] == "run":
+        if output.exists():
+            raise ValueError(f"{output} is there, but not as it was made; move it away, then run the command again")
+        # The zoo cannot go on where it was killed.
+        for leftover in work.iterdir():
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+    start = time.monotonic()
+    print(f"$ python -m {' '.join(cell['command'])}", flush=True)
+    code = subprocess.run([sys.executable, "-m", *cell["command"]], stdin=subprocess.DEVNULL).returncode
+    if code:
+        sys.exit(code if code > 0 else 1)
+    made = next(work.glob(f"*/{cell['settings']['env_id']}_1")) if cell["kind"] == "run" else output
+    content = {
+        **cell,
+        "digest": file_digest(made / cell["proof"]),
+        "seconds": round(time.monotonic() - start, 1),
+        "host": socket.gethostname(),
+        "versions": {"sb3_abisim": __version__, "python": platform.python_version()},
+    }
+    marker = marker_path(root, cell["name"])
+    marker.parent.mkdir(exist_ok=True)
+    write_atomic(marker, lambda file: file.write(json.dumps(content, indent=1).encode()))
+    if made != output:
+        # After the marker: a kill in between leaves no folder that would stand in the way.
+        made.rename(output)
+
+
+if __name__ == "__main__":
+    main()
