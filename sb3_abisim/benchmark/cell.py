@@ -4,6 +4,7 @@ An engine starts this program, here or on another machine. It holds standard inp
 it dies, the input ends and the command is killed with all that it started, so that no orphan goes on writing.
 """
 
+import contextlib
 import json
 import os
 import platform
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +54,12 @@ class CellError(RuntimeError):
     """A cell's command failed; the message ends with the last lines of its log."""
 
 
-def launch(root: Path, cell: dict[str, Any], threads: int, started: Any = None) -> None:
+def launch(
+    root: Path,
+    cell: dict[str, Any],
+    threads: int,
+    started: Callable[["subprocess.Popen[bytes]"], object] = lambda process: None,
+) -> None:
     """Run a cell in a program of its own and wait for its end.
 
     :param root: the benchmark's folder
@@ -72,8 +79,7 @@ def launch(root: Path, cell: dict[str, Any], threads: int, started: Any = None) 
             [sys.executable, "-m", "sb3_abisim.benchmark.cell"],
             cwd=root, env=environment, stdin=subprocess.PIPE, stdout=file, stderr=file, start_new_session=True,
         )  # fmt: skip
-    if started is not None:
-        started(process)
+    started(process)
     assert process.stdin is not None
     try:
         process.stdin.write(json.dumps(cell).encode() + b"\n")
@@ -97,16 +103,17 @@ def kill(process: "subprocess.Popen[bytes]") -> None:
 
     :param process: as given to ``started``
     """
-    try:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
-    except (ProcessLookupError, PermissionError):
-        pass
     process.wait()
 
 
 def main() -> None:
     """Run the cell that standard input names, in the working directory, which is the benchmark's folder."""
-    cell = json.loads(sys.stdin.buffer.readline())
+    line = b""
+    while not line.endswith(b"\n"):
+        line += os.read(0, 1 << 16) or sys.exit("the engine died before it named a cell")
+    cell = json.loads(line)
     threading.Thread(target=_die_with_engine, daemon=True).start()
     root = Path.cwd()
     work = root / "work" / cell["name"]
@@ -125,7 +132,8 @@ def main() -> None:
 
 
 def _die_with_engine() -> None:
-    while sys.stdin.buffer.read1():
+    # Not through sys.stdin, whose lock a thread must not hold when Python ends.
+    while os.read(0, 1):
         pass
     os.killpg(os.getpgrp(), signal.SIGKILL)
 

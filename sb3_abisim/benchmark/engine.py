@@ -97,13 +97,14 @@ class _Run:
     def __init__(self, root: Path, cells: Sequence[Cell], engine: Engine, progress: bool) -> None:
         self.root, self.cells, self.engine = root, cells, engine
         self.done = {cell.name for cell in cells if is_done(root, cell.to_json())}
-        # What was made once is not made again for an input that has been cleared away since.
         self.running: dict[Future[None], tuple[Cell, float]] = {}
         self.waiting = [cell for cell in cells if cell.name not in self.done]
         self.errors: dict[str, str] = {}
         self.failed: set[str] = set()
         self.rates = _measured_rates(root, cells)
-        self.bar = tqdm(total=1.0, disable=not progress, bar_format="{l_bar}{bar}| {postfix}", mininterval=0)
+        self.bar = tqdm(
+            total=1.0, disable=not progress, bar_format="{percentage:3.0f}%|{bar:20}| {desc}", mininterval=0
+        )
 
     def run(self) -> dict[str, str]:
         n_kept = len(self.done)
@@ -118,10 +119,9 @@ class _Run:
                 self._show()
         finally:
             self.bar.close()
-        self.bar.disable or print(
-            f"{len(self.done)} of {len(self.cells)} cells done, {n_kept} of them before; {len(self.errors)} failed",
-            file=sys.stderr,
-        )
+        if not self.bar.disable:
+            state = f"{len(self.done)} of {len(self.cells)} cells done, {n_kept} of them before"
+            print(f"{state}; {len(self.errors)} failed", file=sys.stderr)
         return self.errors
 
     def _submit_ready(self) -> None:
@@ -164,7 +164,7 @@ class _Run:
         names = ", ".join(cell.title for cell, _ in list(self.running.values())[:2])
         state = f"{len(self.done)}/{len(self.cells)} cells, about {clock} left"
         more = f", +{len(self.running) - 2}" if len(self.running) > 2 else ""
-        self.bar.set_postfix_str(f"{state}; {names}{more}" if names else state)
+        self.bar.set_description_str(f"{state}; {names}{more}" if names else state)
 
     def _seconds(self, cell: Cell) -> float:
         return cell.units * self.rates.get(_rate_name(cell), _FIRST_GUESS[cell.kind])

@@ -1,8 +1,8 @@
 """The cells of a benchmark: what there is to collect, pretrain, train and evaluate, each named by what determines it.
 
-A cell's key is a hash over its kind, the package's version, its settings and the keys of its inputs. Two benchmarks that
-need the same dataset therefore find the same folder, and a changed setting gives new names to what depends on it and to
-nothing else. Changes of code without a change of version are not seen: remove the folder, or name a new one.
+A cell's key is a hash over its kind, the package's version, its settings and the keys of its inputs. Two benchmarks
+that need the same dataset therefore find the same folder, and a changed setting gives new names to what depends on it
+and to nothing else. Changes of code without a change of version are not seen: remove the folder, or name a new one.
 """
 
 import dataclasses
@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from sb3_abisim._version import __version__
+from sb3_abisim.benchmark.evaluate import SPLITS
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.pretrain import OBJECTIVE_NAMES, parse_overrides
@@ -25,7 +26,6 @@ from sb3_abisim.zoo import DISTRACTOR_IDS, UNTRAINED, Method, hyperparameters_fi
 PAPER_N_TRANSITIONS = {"Nav2D": 1_000_000, "PointMaze": 250_000}
 # "Steps per eval", given for Pointmass alone.
 PAPER_EVAL_FREQ = 16_384
-SPLITS = ("eval", "train", "clean")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Cell:
 class Plan:
     """What to compare, and with which budget.
 
-    :param methods: as ``--conf-file`` of :mod:`sb3_abisim.zoo` takes them; without ``=ENCODER`` the encoder is pretrained
+    :param methods: as ``--conf-file`` of :mod:`sb3_abisim.zoo` takes them; without ``=ENCODER``, one is pretrained
     :param env_ids: environments of this package
     :param seeds: of RL, one run each
     :param encoder_seeds: of pretraining; the runs take the encoders in turn, so that five of each are paired
@@ -168,7 +168,7 @@ def encoder_cell(plan: Plan, env_id: str, objective: str, seed: int) -> Cell:
     if objective not in OBJECTIVE_NAMES:
         known = ", ".join(OBJECTIVE_NAMES)
         raise ValueError(f"no objective pretrains {objective!r}, only {known}; give a file: {objective}=FILE")
-    inputs = (data_cell(plan, env_id),)
+    inputs: tuple[Cell, ...] = (data_cell(plan, env_id),)
     if objective == "abisim":
         inputs += (encoder_cell(plan, env_id, "ssi", seed),)
     words = _params_of(plan.pretrain_params, objective, OBJECTIVE_NAMES)

@@ -1,0 +1,163 @@
+"""Compare pretraining methods: ``python -m sb3_abisim.benchmark -o DIR``, then ``... benchmark report DIR``."""
+
+import argparse
+import dataclasses
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+from sb3_abisim.atomic import write_atomic
+from sb3_abisim.benchmark.cell import is_done
+from sb3_abisim.benchmark.engine import make_engine, run_cells
+from sb3_abisim.benchmark.evaluate import evaluate_final
+from sb3_abisim.benchmark.graph import Cell, Plan, build
+from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.zoo import EXTRACTORS
+
+DEFAULT_ENV_IDS = ("Nav2D-v0", "PointMaze-v0", "DistractorPointMaze-v0")
+INDEX_NAME = "benchmark.json"
+
+
+def main(argv: list[str] | None = None) -> None:
+    """The command; see ``--help``.
+
+    Exits with 2 for mistakes in the arguments, 1 if a cell failed, 130 after Ctrl-C.
+
+    :param argv: its words; the program's arguments by default
+    """
+    words = sys.argv[1:] if argv is None else argv
+    command, rest = (words[0], words[1:]) if words and words[0] in ("report", "evaluate") else ("run", words)
+    parser = {"run": _run_parser, "report": _report_parser, "evaluate": _evaluate_parser}[command]()
+    args = parser.parse_args(rest)
+    try:
+        {"run": _run, "report": _report, "evaluate": _evaluate}[command](args)
+    except (ValueError, FileNotFoundError) as error:
+        parser.error(str(error))
+    except KeyboardInterrupt:
+        parser.exit(130, "stopped; the same command goes on with the cells that are missing\n")
+
+
+def _run_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "python -m sb3_abisim.benchmark",
+        description="Collect, pretrain, train and evaluate for every method, environment and seed; a rerun does only "
+        "what is missing. `report DIR` draws the comparison, `evaluate RUN` evaluates one run's final model.",
+    )
+    words = ", ".join(EXTRACTORS)
+    parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
+    parser.add_argument("--methods", nargs="+", default=list(EXTRACTORS), metavar="METHOD[=ENCODER][,frozen]",
+                        help=f"of {words}; without an encoder, it is pretrained (default: all)")  # fmt: skip
+    parser.add_argument("--env", nargs="+", default=list(DEFAULT_ENV_IDS), metavar="ID",
+                        help=f"of {', '.join(ENV_IDS)} (default: the paper's)")  # fmt: skip
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4], help="of RL, one run each")
+    parser.add_argument("--encoder-seeds", nargs="+", type=int,
+                        help="of pretraining, taken by the runs in turn (default: those of --seeds)")  # fmt: skip
+    parser.add_argument("--algo", help="rl-zoo3's name (default: the paper's, dqn for Nav2D and ppo else)")
+    parser.add_argument("--n-transitions", type=int, help="to pretrain on (default: the paper's)")
+    parser.add_argument("-n", "--n-timesteps", type=int, help="of RL (default: the paper's)")
+    parser.add_argument(
+        "--eval-freq", type=int, help="steps between evaluations (default: 16384 or n/100, the smaller)"
+    )
+    parser.add_argument("--eval-episodes", type=int, default=20, help="of each evaluation (default: 20)")
+    parser.add_argument("--n-eval-envs", type=int, default=5, help="evaluated side by side (default: 5)")
+    parser.add_argument("--final-episodes", type=int, default=100,
+                        help="of the final model on each split, 0 for none (default: 100)")  # fmt: skip
+    parser.add_argument("-params", "--params", nargs="+", default=[], metavar="[ALGO.]NAME:VALUE",
+                        help="RL hyperparameters, the same for all methods")  # fmt: skip
+    parser.add_argument("--pretrain-params", nargs="+", default=[], metavar="[OBJECTIVE.]NAME:VALUE",
+                        help="settings of pretraining, such as abisim.objective_kwargs.c:0.9")  # fmt: skip
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--threads", type=int, default=1, help="of each cell (default: 1)")
+    parser.add_argument("--jobs", type=int, help="cells at a time (default: as the processors allow)")
+    parser.add_argument("--engine", default="local", choices=("local", "ray"))
+    parser.add_argument("--address", default="auto", help="of the Ray cluster (default: auto)")
+    parser.add_argument("--gpus", type=float, default=0.0, help="per cell, on Ray (default: 0)")
+    parser.add_argument("--retries", type=int, default=3, help="after a lost worker, on Ray (default: 3)")
+    parser.add_argument("--dry-run", action="store_true", help="list the cells and their commands, and stop")
+    parser.add_argument("--no-report", action="store_true", help="do not draw the report at the end")
+    return parser
+
+
+def _run(args: argparse.Namespace) -> None:
+    plan = Plan(
+        methods=tuple(args.methods), env_ids=tuple(args.env), seeds=tuple(args.seeds),
+        encoder_seeds=tuple(args.encoder_seeds or args.seeds), algo=args.algo, n_transitions=args.n_transitions,
+        n_timesteps=args.n_timesteps, eval_freq=args.eval_freq, eval_episodes=args.eval_episodes,
+        n_eval_envs=args.n_eval_envs, final_episodes=args.final_episodes, params=tuple(args.params),
+        pretrain_params=tuple(args.pretrain_params), device=args.device, threads=args.threads,
+    )  # fmt: skip
+    cells, root = build(plan), Path(args.output)
+    if args.dry_run:
+        _list(root, cells)
+        return
+    if not args.no_report:
+        _require_report()
+    if args.engine == "ray":
+        options = {"address": args.address, "gpus": args.gpus, "retries": args.retries}
+    else:
+        options = {}
+    root.mkdir(parents=True, exist_ok=True)
+    engine = make_engine(args.engine, args.jobs, args.threads, **options)
+    errors = run_cells(root, cells, engine)
+    index = {"plan": dataclasses.asdict(plan), "runs": [cell.output for cell in cells if cell.kind == "run"]}
+    write_atomic(root / INDEX_NAME, lambda file: file.write(json.dumps(index, indent=1).encode()))
+    if errors:
+        print(f"{len(errors)} cells failed: {', '.join(errors)}; their logs are in {root / 'logs'}", file=sys.stderr)
+        sys.exit(1)
+    if not args.no_report:
+        _report(_report_parser().parse_args([str(root)]))
+
+
+def _list(root: Path, cells: list[Cell]) -> None:
+    for cell in cells:
+        state = "done" if is_done(root, cell.to_json()) else "missing"
+        print(f"{state:8}{cell.name}  {cell.title}\n        python -m {' '.join(cell.command)}")
+
+
+def _require_report() -> None:
+    missing = [name for name in ("matplotlib", "rliable", "jinja2") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ValueError(f"{' and '.join(missing)} not installed; run: pip install 'sb3_abisim[benchmark]'")
+
+
+def _report_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "python -m sb3_abisim.benchmark report",
+        description="Draw learning curves, tables and aggregates of zoo runs as PNG, CSV and one HTML page.",
+    )
+    parser.add_argument("folders", nargs="+", metavar="[LABEL=]FOLDER",
+                        help="a benchmark's folder, or zoo log folders")  # fmt: skip
+    parser.add_argument("-o", "--output", metavar="DIR", help="(default: report in the first folder)")
+    parser.add_argument("--source", choices=("evaluations", "training"), default="evaluations",
+                        help="learning curves from the zoo's evaluations or from the training episodes")  # fmt: skip
+    parser.add_argument("--reference", default="abisim", help="the method that the others are compared with")
+    parser.add_argument("--thresholds", nargs="+", type=float, default=[0.5, 0.7, 0.9],
+                        help="normalised returns, 0 (never at the goal) to 1 (default: 0.5 0.7 0.9)")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
+    return parser
+
+
+def _report(args: argparse.Namespace) -> None:
+    _require_report()
+    from sb3_abisim.benchmark.report import report
+
+    page = report(args.folders, args.output, args.source, args.reference, args.thresholds, args.seed)
+    print(f"report: {page}")
+
+
+def _evaluate_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "python -m sb3_abisim.benchmark evaluate", description="Evaluate the final model of a zoo run."
+    )
+    parser.add_argument("folder", metavar="RUN", help="a zoo run folder")
+    parser.add_argument("--episodes", type=int, default=100, help="on each split and in each mode (default: 100)")
+    return parser
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    print(evaluate_final(args.folder, args.episodes))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""Evaluate the final model of a zoo run: ``python -m sb3_abisim.benchmark evaluate RUN_FOLDER``.
+
+The zoo evaluates during training, deterministically, on one split of the clips. This says how the model that training
+ended with fares with the most likely and with sampled actions, and, in the Distractor environments, on clips that
+training never showed ("eval"), on those that it showed ("train") and without any ("clean"). Every model meets the same
+mazes.
+"""
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.atomic import write_atomic
+from sb3_abisim.benchmark.runs import read_run
+from sb3_abisim.zoo import DISTRACTOR_IDS
+
+FILE_NAME = "final_evaluations.npz"
+SPLITS = ("eval", "train", "clean")
+MODES = ("deterministic", "sampled")
+N_ENVS = 16
+# Far from the small numbers that people train with.
+SEED = 1_000_000
+
+
+def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
+    """Evaluate the last model of a run and write ``final_evaluations.npz`` into its folder.
+
+    The file holds, for each mode and split (``standard`` where there are no clips), ``<mode>/<split>/results``,
+    ``/ep_lengths`` and ``/successes``, each of shape (n_episodes,).
+
+    :param folder: of a zoo run that has ended
+    :param n_episodes: of each mode on each split
+    :return: the file
+    :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
+    """
+    from rl_zoo3.utils import ALGOS
+
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
+    run = read_run(folder)
+    model_path = run.folder / f"{run.env_id}.zip"
+    if not model_path.is_file():
+        raise ValueError(f"{run.folder} holds no final model ({model_path.name}); let the run end first")
+    model = ALGOS[run.algo].load(model_path, device="cpu")
+    arrays: dict[str, NDArray[Any]] = {}
+    for split in SPLITS if run.env_id in DISTRACTOR_IDS else (None,):
+        for mode in MODES:
+            values = _episodes(model, run.env_id, _split_kwargs(run.env_kwargs, split), n_episodes, mode == MODES[0])
+            arrays |= {f"{mode}/{split or 'standard'}/{name}": array for name, array in values.items()}
+    path = run.folder / FILE_NAME
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    write_atomic(path, lambda file: file.write(buffer.getvalue()))
+    return path
+
+
+def _split_kwargs(env_kwargs: dict[str, Any], split: str | None) -> dict[str, Any]:
+    if split is None:
+        return env_kwargs
+    return {**{name: value for name, value in env_kwargs.items() if name not in ("split", "clips")}, "split": split}
+
+
+def _episodes(
+    model: Any, env_id: str, env_kwargs: dict[str, Any], n_episodes: int, deterministic: bool
+) -> dict[str, NDArray[Any]]:
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.utils import set_random_seed
+
+    successes: list[bool] = []
+
+    def note(scope: dict[str, Any], _: dict[str, Any]) -> None:
+        if scope["done"]:
+            successes.append(bool(scope["info"].get("is_success", False)))
+
+    env = make_vec_env(env_id, min(N_ENVS, n_episodes), seed=SEED, env_kwargs=env_kwargs)
+    set_random_seed(SEED)
+    try:
+        returns, lengths = evaluate_policy(
+            model, env, n_episodes, deterministic=deterministic, callback=note, return_episode_rewards=True
+        )
+    finally:
+        env.close()
+    return {"results": np.array(returns), "ep_lengths": np.array(lengths), "successes": np.array(successes)}

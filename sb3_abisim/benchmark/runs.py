@@ -1,0 +1,186 @@
+"""Read the run folders of rl-zoo3, whoever made them, without executing anything that they hold."""
+
+import dataclasses
+import json
+import re
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from sb3_abisim.zoo import EXTRACTORS
+
+
+class _Loader(yaml.SafeLoader):
+    """The zoo writes ``!!python`` tags; these two are data, all others are refused."""
+
+
+_Loader.add_constructor(
+    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
+    lambda loader, node: OrderedDict(*loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
+)
+_Loader.add_constructor(
+    "tag:yaml.org,2002:python/tuple",
+    lambda loader, node: tuple(loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """Returns over the course of a run.
+
+    :param steps: environment steps, rising, shape (n,)
+    :param returns: mean return at each, shape (n,)
+    :param successes: share of successful episodes at each, shape (n,); None where the run does not say
+    """
+
+    steps: NDArray[np.int64]
+    returns: NDArray[np.float64]
+    successes: NDArray[np.float64] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A zoo run.
+
+    :param folder: where it lies
+    :param label: the method, such as "abisim,frozen"
+    :param env_id: trained in
+    :param algo: rl-zoo3's name
+    :param seed: of RL
+    :param n_timesteps: budget that was asked for
+    :param env_kwargs: of training
+    :param settings: all that two runs which differ only in seeds and encoder files have in common
+    :param command: that made it
+    :param n_eval_episodes: of each evaluation during training
+    """
+
+    folder: Path
+    label: str
+    env_id: str
+    algo: str
+    seed: int
+    n_timesteps: int
+    env_kwargs: dict[str, Any]
+    settings: dict[str, Any]
+    command: str
+    n_eval_episodes: int
+
+    def evaluations(self) -> Curve:
+        """The zoo's evaluations during training.
+
+        :raises ValueError: if there are none
+        """
+        path = self.folder / "evaluations.npz"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} holds no evaluations.npz; train with an --eval-freq above 0")
+        data = np.load(path)
+        successes = data["successes"].mean(axis=1) if "successes" in data else None
+        return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
+
+    def training(self, n_points: int = 200) -> Curve:
+        """The episodes of training itself, with the exploring policy, averaged over equal stretches of steps.
+
+        :param n_points: stretches; those in which no episode ended are left out
+        :raises ValueError: if there are no monitor files
+        """
+        from stable_baselines3.common.monitor import load_results
+
+        if not list(self.folder.glob("*.monitor.csv")):
+            raise ValueError(f"{self.folder} holds no *.monitor.csv; it is no run folder of the zoo")
+        # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
+        episodes = load_results(str(self.folder))
+        ends = episodes["l"].cumsum().to_numpy()
+        stretch = np.minimum((ends - 1) * n_points // max(self.n_timesteps, int(ends[-1])), n_points - 1)
+        width = max(self.n_timesteps, int(ends[-1])) / n_points
+        kept = np.unique(stretch)
+        columns = [episodes[name].to_numpy(float) for name in ("r", "is_success") if name in episodes]
+        means = [np.array([column[stretch == k].mean() for k in kept]) for column in columns]
+        return Curve(((kept + 1) * width).astype(np.int64), means[0], means[1] if len(means) == 2 else None)
+
+    def final(self) -> dict[str, NDArray[Any]] | None:
+        """What :mod:`sb3_abisim.benchmark.evaluate` wrote: ``<mode>/<split>/results`` and so on; None if it did not."""
+        path = self.folder / "final_evaluations.npz"
+        return dict(np.load(path)) if path.is_file() else None
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read a run folder.
+
+    :param folder: ``.../<algo>/<Env-vN>_<id>``
+    :raises ValueError: if it is none
+    """
+    folder = Path(folder)
+    found = list(folder.glob("*/args.yml"))
+    if len(found) != 1:
+        raise ValueError(f"{folder} is no run folder of rl-zoo3 (no <Env>/args.yml in it)")
+    args, config = _read_yaml(found[0]), _read_yaml(found[0].with_name("config.yml"))
+    try:
+        n_timesteps = int(args["n_timesteps"] if args["n_timesteps"] > 0 else config["n_timesteps"])
+        command = found[0].with_name("command.txt")
+        # What names the encoder's file differs between encoder seeds; the label says whatever else is in there.
+        plain = {name: value for name, value in config.items() if name not in ("policy_kwargs", "n_timesteps")}
+        names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
+        return Run(
+            folder=folder,
+            label=_label(str(config.get("policy_kwargs", "")), str(args["algo"])),
+            env_id=args["env"],
+            algo=args["algo"],
+            seed=int(args["seed"]),
+            n_timesteps=n_timesteps,
+            env_kwargs=config.get("env_kwargs") or args["env_kwargs"] or {},
+            settings={**{name: args[name] for name in names}, "n_timesteps": n_timesteps, **plain},
+            command=command.read_text() if command.is_file() else "",
+            n_eval_episodes=int(args["eval_episodes"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{found[0]} was not written by rl_zoo3.train ({error!r})") from error
+
+
+def find_runs(folder: str | Path) -> list[Run]:
+    """All runs below a folder, or those of the last command of a benchmark's folder.
+
+    :param folder: a benchmark's folder, a zoo's log folder, or a run's own
+    :raises ValueError: if there are none
+    """
+    folder = Path(folder)
+    index = folder / "benchmark.json"
+    if index.is_file():
+        paths = [folder / name for name in json.loads(index.read_bytes())["runs"]]
+        paths = [path for path in paths if path.is_dir()]
+    else:
+        paths = sorted(path.parent.parent for path in folder.glob("**/args.yml"))
+    if not paths:
+        raise ValueError(f"no run folders of rl-zoo3 below {folder}; train first, or give its log folder")
+    return [read_run(path) for path in paths]
+
+
+def is_deterministic(env_id: str) -> bool | None:
+    """Whether the zoo's evaluations during training take the most likely action.
+
+    :param env_id: trained in
+    :return: None where the environment is not registered here
+    """
+    import gymnasium as gym
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    if env_id not in gym.registry:
+        return None
+    return not (ExperimentManager.is_atari(env_id) or ExperimentManager.is_minigrid(env_id))
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        return dict(yaml.load(path.read_text(encoding="utf-8"), _Loader))
+    except (OSError, yaml.YAMLError, TypeError) as error:
+        raise ValueError(f"cannot read {path} ({error}); was it written by rl_zoo3.train?") from error
+
+
+def _label(policy_kwargs: str, algo: str) -> str:
+    for method, class_name in EXTRACTORS.items():
+        if re.search(rf"\b{class_name}\b", policy_kwargs):
+            return method + (",frozen" if re.search(r"['\"]?freeze['\"]?\s*[:=]\s*True", policy_kwargs) else "")
+    return algo
