@@ -1,0 +1,190 @@
+"""The report of a benchmark: PNG, CSV and one HTML page that needs no other file."""
+
+import base64
+import csv
+import io
+import math
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from sb3_abisim._version import __version__
+from sb3_abisim.atomic import write_atomic
+from sb3_abisim.benchmark import statistics
+from sb3_abisim.benchmark.comparison import Comparison, Row, compare
+from sb3_abisim.benchmark.figures import SPLIT_NAMES, draw
+from sb3_abisim.benchmark.runs import is_deterministic
+
+METHOD_NAMES = {
+    "abisim": "action-bisimulation",
+    "ssi": "single-step inverse dynamics",
+    "acro": "multi-step inverse dynamics (ACRO)",
+    "beta_vae": "β-VAE",
+    "curl": "CURL",
+    "info_nce": "InfoNCE",
+    "vanilla": "trained from scratch",
+}
+BOUND_SIGNS = {"": "", "<=": "≤ ", ">=": "≥ ", "~": "≈ "}
+
+
+def report(
+    folders: Sequence[str],
+    output: str | Path | None = None,
+    source: str = "evaluations",
+    reference: str = "abisim",
+    thresholds: Sequence[float] = (0.5, 0.7, 0.9),
+    seed: int = 0,
+) -> Path:
+    """Compare runs and write the report; the same runs and arguments give the same files.
+
+    :param folders: as for :func:`~sb3_abisim.benchmark.comparison.compare`
+    :param output: folder for the files; None for ``report`` in the first of ``folders``
+    :param source: "evaluations" or "training"
+    :param reference: label of the method that the others are compared with
+    :param thresholds: normalised returns
+    :param seed: of the bootstrap
+    :return: the page
+    :raises ValueError: if the runs cannot be compared
+    """
+    folder = Path(output) if output is not None else Path(folders[0].rpartition("=")[2]) / "report"
+    comparison = compare(folders, source, reference, thresholds, seed)
+    pictures = draw(comparison)
+    page = render(comparison, pictures)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {f"{name}.png": picture for name, picture in pictures.items()}
+    for name in ("curves", "final", "thresholds", "aggregates", "profiles", "improvement"):
+        rows = getattr(comparison, name)
+        if rows:
+            files[f"{name}.csv"] = _csv(rows)
+    files["index.html"] = page.encode()
+    for name, content in files.items():
+        write_atomic(folder / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
+    return folder / "index.html"
+
+
+def _csv(rows: list[Row]) -> bytes:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+def render(comparison: Comparison, pictures: dict[str, bytes]) -> str:
+    """The page.
+
+    :param comparison: its numbers
+    :param pictures: name to PNG file
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters |= {"number": _number, "plus_minus": _plus_minus, "ratio": _ratio}
+    template = environment.from_string(resources.files(__package__).joinpath("report.html").read_text(encoding="utf-8"))
+    images = {name: f"data:image/png;base64,{base64.b64encode(data).decode()}" for name, data in pictures.items()}
+    labels = list(dict.fromkeys(label for methods in comparison.groups.values() for label in methods))
+    return template.render(
+        comparison=comparison,
+        images=images,
+        cards=[_card(comparison, env_id) for env_id in comparison.groups],
+        final=_final_table(comparison),
+        splits=_split_table(comparison),
+        split_names=SPLIT_NAMES,
+        names={label: METHOD_NAMES.get(label.removesuffix(",frozen"), "") for label in labels},
+        acting=_acting(comparison),
+        window=statistics.WINDOW,
+        n_resamples=statistics.N_RESAMPLES,
+        version=__version__,
+    )
+
+
+def _acting(comparison: Comparison) -> str:
+    """How the agents acted where the learning curves come from."""
+    if comparison.source == "training":
+        return (
+            "Learning curves show the training episodes themselves, in which the agent explores: actions are sampled."
+        )
+    states = {env_id: is_deterministic(env_id) for env_id in comparison.groups}
+    if all(states.values()):
+        text = "Evaluation is deterministic: the agent takes its most likely action."
+    else:
+        names = {True: "deterministic", False: "with sampled actions", None: "of unknown kind (not registered here)"}
+        text = f"Evaluation is {', '.join(f'{names[state]} in {env_id}' for env_id, state in states.items())}."
+    counts = sorted({run.n_eval_episodes for _, group in _groups(comparison) for run in group.runs})
+    return f"{text} Each evaluation is the mean of {' or '.join(map(str, counts))} episodes."
+
+
+def _groups(comparison: Comparison) -> list[tuple[str, Any]]:
+    return [(env_id, group) for env_id, methods in comparison.groups.items() for group in methods.values()]
+
+
+def _card(comparison: Comparison, env_id: str) -> dict[str, Any]:
+    """What a reader in a hurry takes away for an environment: the highest threshold that the reference always reached."""
+    rows = [row for row in comparison.thresholds if row["env_id"] == env_id and row["baseline"] != comparison.reference]
+    always = [row for row in rows if row["reached_reference"] == row["n_reference"]]
+    rows = [row for row in always if row["threshold"] == max(r["threshold"] for r in always)]
+    lines = [
+        f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f} × the steps of {row['baseline']} {_verdict(row)}"
+        for row in rows
+    ]
+    counts = {len(group.runs) for group in comparison.groups[env_id].values()}
+    return {
+        "env_id": env_id,
+        "n_runs": f"{min(counts)} to {max(counts)}" if len(counts) > 1 else str(min(counts)),
+        "level": rows[0]["return"] if rows else None,
+        "lines": lines,
+    }
+
+
+def _verdict(row: Row) -> str:
+    if not math.isfinite(row["low"]):
+        return "(one run: no interval)"
+    if row["high"] < 1:
+        return "– fewer"
+    return "– more" if row["low"] > 1 else "– no clear difference"
+
+
+def _final_table(comparison: Comparison) -> list[dict[str, Any]]:
+    """One row per environment and method, with both ways of acting side by side; unseen clips where there are clips."""
+    table: dict[tuple[str, str], dict[str, Any]] = {}
+    for row in comparison.final:
+        if row["split"] in ("train", "clean"):
+            continue
+        key = (row["env_id"], row["method"])
+        entry = table.setdefault(key, {"env_id": key[0], "method": key[1], "n_runs": row["n_runs"], "paper": None})
+        entry[row["mode"]] = (row["mean"], row["half_width"])
+        entry["where"] = row["split"]
+        if row["paper"] is not None:
+            entry["paper"] = (row["paper"], row["paper_plus_minus"])
+    return list(table.values())
+
+
+def _split_table(comparison: Comparison) -> list[dict[str, Any]]:
+    table: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for row in comparison.final:
+        if row["split"] in SPLIT_NAMES:
+            key = (row["env_id"], row["method"], row["mode"])
+            entry = table.setdefault(key, dict(zip(("env_id", "method", "mode"), key, strict=True)))
+            entry[row["split"]] = (row["mean"], row["half_width"])
+    return list(table.values())
+
+
+def _number(value: float) -> str:
+    return f"{value:,.0f}"
+
+
+def _plus_minus(pair: tuple[float, float] | None) -> str:
+    if pair is None:
+        return "–"
+    mean, half = pair
+    return f"{mean:.1f} ± {half:.1f}".replace("-", "−") if math.isfinite(half) else f"{mean:.1f}".replace("-", "−")
+
+
+def _ratio(row: Row) -> str:
+    if not math.isfinite(row["ratio"]):
+        return "none arrived"
+    text = f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f}"
+    return f"{text} [{row['low']:.2f}, {row['high']:.2f}]" if math.isfinite(row["low"]) else text
