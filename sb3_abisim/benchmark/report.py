@@ -122,12 +122,12 @@ def _groups(comparison: Comparison) -> list[tuple[str, Any]]:
 
 
 def _card(comparison: Comparison, env_id: str) -> dict[str, Any]:
-    """What a reader in a hurry takes away for an environment: the highest threshold that the reference always reached."""
+    """What a reader in a hurry takes away: the highest threshold that all runs of the reference reached."""
     rows = [row for row in comparison.thresholds if row["env_id"] == env_id and row["baseline"] != comparison.reference]
     always = [row for row in rows if row["reached_reference"] == row["n_reference"]]
     rows = [row for row in always if row["threshold"] == max(r["threshold"] for r in always)]
     lines = [
-        f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f} × the steps of {row['baseline']} {_verdict(row)}"
+        f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f} times the steps of {row['baseline']}: {_verdict(row)}"
         for row in rows
     ]
     counts = {len(group.runs) for group in comparison.groups[env_id].values()}
@@ -141,10 +141,10 @@ def _card(comparison: Comparison, env_id: str) -> dict[str, Any]:
 
 def _verdict(row: Row) -> str:
     if not math.isfinite(row["low"]):
-        return "(one run: no interval)"
+        return "one run, no interval"
     if row["high"] < 1:
-        return "– fewer"
-    return "– more" if row["low"] > 1 else "– no clear difference"
+        return "fewer"
+    return "more" if row["low"] > 1 else "no clear difference"
 
 
 def _final_table(comparison: Comparison) -> list[dict[str, Any]]:
@@ -178,9 +178,10 @@ def _number(value: float) -> str:
 
 def _plus_minus(pair: tuple[float, float] | None) -> str:
     if pair is None:
-        return "–"
+        return ""
     mean, half = pair
-    return f"{mean:.1f} ± {half:.1f}".replace("-", "−") if math.isfinite(half) else f"{mean:.1f}".replace("-", "−")
+    text = f"{mean:.1f} ± {half:.1f}" if math.isfinite(half) else f"{mean:.1f}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def _ratio(row: Row) -> str:
