@@ -1,0 +1,136 @@
+"""What names a cell, and what a changed setting changes."""
+
+import dataclasses
+
+import pytest
+
+from sb3_abisim.benchmark.graph import Cell, Plan, build
+from sb3_abisim.zoo import DISTRACTOR_IDS
+
+PLAN = Plan(methods=("abisim", "ssi", "vanilla"), env_ids=("Nav2D-v0", "DistractorPointMaze-v0"), seeds=(0, 1))
+
+
+def names(cells: list[Cell]) -> set[str]:
+    return {cell.name for cell in cells}
+
+
+def changed(**changes: object) -> list[str]:
+    """Titles of the cells that a plan with other settings has and the plan has not."""
+    there = names(build(PLAN))
+    return sorted(cell.title for cell in build(dataclasses.replace(PLAN, **changes)) if cell.name not in there)
+
+
+def test_every_cell_once_and_after_its_inputs() -> None:
+    cells = build(PLAN)
+    seen: set[str] = set()
+    for cell in cells:
+        assert cell.name not in seen
+        assert {source.name for source in cell.inputs} <= seen
+        seen.add(cell.name)
+    # One dataset per environment; two encoders per objective, environment and seed; a run and its evaluation for each.
+    kinds = [cell.kind for cell in cells]
+    assert {kind: kinds.count(kind) for kind in kinds} == {"data": 2, "encoder": 8, "run": 12, "final": 12}
+    assert len({cell.output for cell in cells if cell.kind == "run"}) == 12
+
+
+def test_c_reruns_what_depends_on_it_and_nothing_else() -> None:
+    found = changed(pretrain_params=("abisim.objective_kwargs.c:0.5",))
+    expected = []
+    for env_id, algo in (("Nav2D-v0", "dqn"), ("DistractorPointMaze-v0", "ppo")):
+        for seed in (0, 1):
+            expected.append(f"pretrain abisim {env_id} seed {seed}")
+            expected += [f"{algo} abisim {env_id} seed {seed}", f"{algo} final abisim {env_id} seed {seed}"]
+    assert found == sorted(expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"params": ("dqn.gamma:0.9",)}, {"dqn", "dqn final"}),
+        ({"params": ("ppo.gamma:0.9",)}, {"ppo", "ppo final"}),
+        ({"eval_episodes": 7}, {"dqn", "dqn final", "ppo", "ppo final"}),
+        ({"final_episodes": 7}, {"dqn final", "ppo final"}),
+        ({"device": "cpu"}, set()),
+        ({"threads": 2}, set()),
+        ({"seeds": (1, 0), "encoder_seeds": (1, 0)}, set()),
+    ],
+)
+def test_what_a_setting_reaches(changes: dict[str, object], expected: set[str]) -> None:
+    plan = {"methods": ("vanilla",)}
+    there = names(build(dataclasses.replace(PLAN, **plan)))
+    fresh = [cell for cell in build(dataclasses.replace(PLAN, **plan, **changes)) if cell.name not in there]
+    assert {cell.title.partition(" vanilla")[0] for cell in fresh} == expected
+
+
+def test_the_base_encoder_reaches_those_that_rest_on_it() -> None:
+    titles = changed(pretrain_params=("ssi.batch_size:128",))
+    assert not [title for title in titles if "vanilla" in title or "collect" in title]
+    assert len(titles) == 8 + 16, "both encoders of each seed and environment, their runs and the evaluations"
+
+
+def test_the_commands_carry_the_settings() -> None:
+    plan = dataclasses.replace(
+        PLAN, methods=("abisim,frozen",), env_ids=("Nav2D-v0",), n_timesteps=500, eval_freq=50, params=("gamma:0.9",),
+        pretrain_params=("n_updates:7", "ssi.batch_size:8"), n_transitions=300,
+    )  # fmt: skip
+    by_title = {cell.title: cell for cell in build(plan)}
+    run = " ".join(by_title["dqn abisim,frozen Nav2D-v0 seed 1"].command)
+    encoder = by_title["pretrain abisim Nav2D-v0 seed 1"]
+    assert f"--conf-file abisim={encoder.output},frozen " in run
+    assert "-n 500 --seed 1 --eval-freq 50 --eval-episodes 20 --n-eval-envs 5" in run and run.endswith(
+        "-params gamma:0.9"
+    )
+    base = by_title["pretrain ssi Nav2D-v0 seed 1"]
+    assert base.command[-2:] == ("n_updates:7", "batch_size:8") and encoder.command[-1:] == ("n_updates:7",)
+    assert encoder.command[encoder.command.index("--base") + 1] == base.output
+    assert encoder.units == 7 and "-n 300" in " ".join(by_title["collect Nav2D-v0"].command)
+
+
+def test_runs_that_differ_in_seeds_share_a_folder_and_no_others_do() -> None:
+    runs = [cell for cell in build(PLAN) if cell.kind == "run"]
+    folders = {cell.output.rpartition("/")[0] for cell in runs}
+    assert len(folders) == len(PLAN.methods) * len(PLAN.env_ids)
+    other = build(dataclasses.replace(PLAN, pretrain_params=("abisim.objective_kwargs.c:0.5",)))
+    fresh = {cell.output.rpartition("/")[0] for cell in other if cell.kind == "run"} - folders
+    assert len(fresh) == 2 and all("/abisim-" in folder for folder in fresh)
+    # rl_zoo3's --exp-id takes a number.
+    assert all(cell.output.rpartition("_")[2].isdigit() for cell in runs)
+
+
+def test_encoders_are_taken_in_turn() -> None:
+    plan = dataclasses.replace(PLAN, methods=("ssi",), env_ids=("Nav2D-v0",), seeds=(0, 1, 2), encoder_seeds=(7, 8))
+    seeds = [cell.inputs[0].settings["seed"] for cell in build(plan) if cell.kind == "run"]
+    assert seeds == [7, 8, 7]
+
+
+def test_a_given_encoder_is_known_by_its_content() -> None:
+    plan = dataclasses.replace(PLAN, methods=("ssi=Nav2D-v0/ssi",), env_ids=("Nav2D-v0",), seeds=(0,))
+    (run,) = (cell for cell in build(plan) if cell.kind == "run")
+    assert run.inputs == () and len(run.settings["encoder_digest"]) == 64
+    assert "ssi=Nav2D-v0/ssi" in run.command
+
+
+def test_distractors_are_evaluated_on_three_splits() -> None:
+    for cell in build(PLAN):
+        if cell.kind == "final":
+            distracted = cell.inputs[0].settings["env_id"] in DISTRACTOR_IDS
+            assert cell.settings["splits"] == (["eval", "train", "clean"] if distracted else [])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"methods": ("abisym",)}, "unknown method 'abisym'"),
+        ({"methods": ("ssi", "ssi")}, "each once, got ssi ssi"),
+        ({"env_ids": ("Nav3D-v0",)}, "unknown environment 'Nav3D-v0'"),
+        ({"seeds": ()}, "seeds must be given"),
+        ({"seeds": (-1,)}, "seeds must be at least 0, got -1"),
+        ({"n_timesteps": 0}, "n_timesteps must be at least 1, got 0"),
+        ({"algo": "sac"}, "no hyperparameters of sac for Nav2D-v0"),
+        ({"params": ("gamma",)}, "name:value, got 'gamma'"),
+        ({"pretrain_params": ("n_update:3",)}, "unknown pretraining setting n_update"),
+    ],
+)
+def test_mistakes_are_named(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(dataclasses.replace(PLAN, **changes))

@@ -1,0 +1,74 @@
+"""The same cells on a cluster of two nodes, one of which dies."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_abisim.benchmark.engine import run_cells
+from sb3_abisim.benchmark.graph import Cell, Plan, build
+from sb3_abisim.benchmark.ray_engine import RayEngine, _execute
+
+# Ray's own programs leave sockets and files open.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+]
+PLAN = Plan(
+    methods=("vanilla",), env_ids=("Nav2D-v0",), seeds=(0, 1), n_timesteps=2000, eval_freq=500, eval_episodes=4,
+    final_episodes=0, params=("dqn.learning_starts:100",), device="cpu",
+)  # fmt: skip
+
+
+def test_a_node_of_another_version_or_without_the_folder_is_refused(tmp_path: Path) -> None:
+    from sb3_abisim._version import __version__
+    from sb3_abisim.benchmark.cell import CellError
+
+    cell = build(PLAN)[0].to_json()
+    with pytest.raises(CellError, match=r"has sb3_abisim .* runs with 0\.0\.1"):
+        _execute(str(tmp_path), "token", "0.0.1", cell, 1)
+    with pytest.raises(CellError, match="a folder that all nodes share"):
+        _execute(str(tmp_path), "token", __version__, cell, 1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_killed_node_costs_its_cell_another_start_and_nothing_else(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    node = cluster.add_node(num_cpus=1)
+    killed: list[float] = []
+
+    class KillingEngine(RayEngine):
+        """Kills the second node once both cells train."""
+
+        def submit(self, root: Path, cell: Cell) -> Any:
+            future = super().submit(root, cell)
+            list_running.append(cell)
+            if len(list_running) == 2:
+                deadline = time.monotonic() + 120
+                while len(list(root.glob("work/*/dqn/*/evaluations.npz"))) < 2 and time.monotonic() < deadline:
+                    time.sleep(0.1)
+                cluster.remove_node(node, allow_graceful=False)
+                killed.append(time.monotonic())
+            return future
+
+    list_running: list[Cell] = []
+    try:
+        cells = build(PLAN)
+        engine = KillingEngine(address=cluster.address)
+        assert engine.n_slots == 2
+        assert run_cells(tmp_path, cells, engine, progress=False) == {}
+        assert killed and len(list_running) == 2
+        starts = [(tmp_path / "logs" / f"{cell.name}.log").read_text().count("$ python -m") for cell in cells]
+        assert sorted(starts) == [1, 2], "the cell on the dead node starts again, the other does not"
+        for cell in cells:
+            evaluations = np.load(tmp_path / cell.output / "evaluations.npz")
+            assert evaluations["timesteps"].tolist() == [500, 1000, 1500, 2000]
+        assert not list(tmp_path.glob("work/*")), "nothing half done is left"
+    finally:
+        cluster.shutdown()

@@ -1,0 +1,179 @@
+"""The report, from run folders alone."""
+
+import csv
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmark_inputs import write_run
+from PIL import Image
+
+from sb3_abisim.benchmark.__main__ import main
+from sb3_abisim.benchmark.comparison import compare
+from sb3_abisim.benchmark.report import report
+from sb3_abisim.benchmark.runs import find_runs, read_run
+
+STEPS = list(range(1000, 11_000, 1000))
+# The step at which a method jumps from -100 to -20, per seed; above the last step it never does.
+JUMPS = {"abisim": (3000, 4000), "ssi": (6000, 8000), "vanilla": (9000, 99_000)}
+N_EPISODES = 4
+
+
+def write_all(folder: Path, env_ids: tuple[str, ...] = ("PointMaze-v0", "DistractorPointMaze-v0")) -> Path:
+    rng = np.random.default_rng(0)
+    for env_id in env_ids:
+        for method, jumps in JUMPS.items():
+            for seed, jump in enumerate(jumps):
+                means = np.where(np.array(STEPS) >= jump, -20.0, -100.0)
+                # Episodes differ, their mean is exact.
+                noise = rng.normal(size=(len(STEPS), N_EPISODES))
+                returns = means[:, None] + noise - noise.mean(axis=1, keepdims=True)
+                final = {f"deterministic/{split}": means[-1:] - i for i, split in enumerate(("train", "eval", "clean"))}
+                final |= {"sampled/eval": means[-1:] + 5}
+                write_run(folder / method, env_id, method, seed, STEPS, returns,
+                          final=final if env_id.startswith("Distractor") else None)  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_all(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="module")
+def made(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return report([str(logs)], tmp_path_factory.mktemp("report")).parent
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_curves_hold_mean_and_interval(made: Path) -> None:
+    found = [r for r in rows(made / "curves.csv") if (r["env_id"], r["method"]) == ("PointMaze-v0", "ssi")]
+    by_step = {int(r["steps"]): r for r in found}
+    # At 7000 one of two runs has jumped: mean -60, standard deviation 80 / sqrt(2), t quantile for 1 degree 12.7062.
+    row = by_step[7000]
+    half = 12.7062 * 80 / np.sqrt(2) / np.sqrt(2)
+    assert [float(row[key]) for key in ("mean", "low", "high")] == pytest.approx(
+        [-60, -60 - half, -60 + half], rel=1e-4
+    )
+    assert row["n_runs"] == "2" and len(found) == len(STEPS)
+
+
+def test_thresholds_are_ratios_of_steps(made: Path) -> None:
+    table = {(r["env_id"], float(r["threshold"]), r["baseline"]): r for r in rows(made / "thresholds.csv")}
+    row = table["PointMaze-v0", 0.7, "ssi"]
+    # 0.7 of the way from -128 to 0, passed with the third evaluation after the jump (two of -20 do not suffice).
+    assert float(row["return"]) == pytest.approx(-38.4)
+    assert float(row["steps_reference"]) == 5500 and float(row["steps_baseline"]) == 9000
+    assert float(row["ratio"]) == pytest.approx(5500 / 9000) and row["bound"] == ""
+    row = table["PointMaze-v0", 0.7, "vanilla"]
+    assert (row["reached_reference"], row["reached_baseline"], row["bound"]) == ("2", "0", "<=")
+    assert float(row["ratio"]) == pytest.approx(0.55)
+
+
+def test_final_table_stands_beside_the_papers(made: Path) -> None:
+    table = {(r["env_id"], r["method"], r["mode"], r["split"]): r for r in rows(made / "final.csv")}
+    row = table["PointMaze-v0", "abisim", "deterministic", "last evaluation"]
+    assert float(row["mean"]) == pytest.approx(-20)
+    assert (float(row["paper"]), float(row["paper_plus_minus"])) == (-30.8, 3.7)
+    for i, split in enumerate(("train", "eval", "clean")):
+        row = table["DistractorPointMaze-v0", "vanilla", "deterministic", split]
+        assert float(row["mean"]) == -60 - i and row["paper"] == ""
+
+
+def test_aggregates_cover_what_all_methods_share(made: Path) -> None:
+    found = {(r["score"], r["method"]): float(r["iqm"]) for r in rows(made / "aggregates.csv")}
+    # Two runs in two environments: the IQM is the mean of the middle two of four.
+    assert found["final", "abisim"] == pytest.approx((108 / 128 + 107 / 128) / 2)
+    assert found["area", "abisim"] > found["area", "ssi"] > found["area", "vanilla"]
+    improvement = {r["baseline"]: float(r["probability"]) for r in rows(made / "improvement.csv")}
+    # Equal in all runs with ssi; of four pairs with vanilla two are won and two are ties.
+    assert improvement == pytest.approx({"ssi": 0.5, "vanilla": 0.75})
+
+
+class Page(HTMLParser):
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [str(value) for name, value in attrs if name in ("src", "href")]
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_page_needs_no_other_file_and_says_how_it_was_evaluated(made: Path) -> None:
+    page = Page((made / "index.html").read_text())
+    text = re.sub(r"\s+", " ", " ".join(page.words))
+    assert len(page.sources) == 6 and all(source.startswith("data:image/png;base64,") for source in page.sources)
+    assert "Evaluation is deterministic" in text and f"mean of {N_EPISODES} episodes" in text
+    assert "python -m sb3_abisim.zoo train --seed 1" in text
+    assert "0.61 times the steps of ssi" in text
+    for name in ("curves", "thresholds", "splits", "aggregates", "profiles", "improvement"):
+        with Image.open(made / f"{name}.png") as picture:
+            assert len(picture.convert("RGB").getcolors(1 << 24)) > 10, name
+
+
+def test_the_same_runs_give_the_same_files(made: Path, logs: Path, tmp_path: Path) -> None:
+    np.random.seed(77)
+    report([str(logs)], tmp_path)
+    for path in sorted(made.iterdir()):
+        assert (tmp_path / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_training_episodes_as_source(tmp_path: Path) -> None:
+    run = write_run(tmp_path, "PointMaze-v0", "abisim", 0, STEPS, np.full((len(STEPS), 2), -50.0))
+    lines = ["#{}", "r,l,t,is_success", *(f"{-100 + i},100,{i}.5,{i >= 50}" for i in range(100))]
+    (run / "0.monitor.csv").write_text("\n".join(lines) + "\n")
+    curve = read_run(run).training(n_points=10)
+    # 10,000 steps in ten stretches of ten episodes each.
+    assert curve.steps.tolist() == STEPS
+    assert curve.returns.tolist() == [-95.5 + 10 * i for i in range(10)]
+    assert curve.successes is not None and curve.successes.tolist() == [0] * 5 + [1] * 5
+    main(["report", str(tmp_path), "--source", "training"])
+    text = (tmp_path / "report" / "index.html").read_text()
+    assert "the training episodes themselves" in text and "Evaluation is deterministic" not in text
+    assert "No aggregates across environments" in text
+
+
+def test_labels(tmp_path: Path) -> None:
+    for method in ("abisim", "abisim,frozen", "vanilla"):
+        write_run(tmp_path, "PointMaze-v0", method, 0, STEPS, np.zeros((len(STEPS), 1)))
+    assert sorted(run.label for run in find_runs(tmp_path)) == ["abisim", "abisim,frozen", "vanilla"]
+    groups = compare([f"mine={tmp_path / 'ppo' / 'PointMaze-v0_1'}"], "evaluations", "mine", [0.5]).groups
+    assert list(groups["PointMaze-v0"]) == ["mine"]
+
+
+def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
+    returns = np.zeros((len(STEPS), 1))
+    with pytest.raises(ValueError, match="no run folders of rl-zoo3 below"):
+        compare([str(tmp_path)], "evaluations", "abisim", [0.5])
+    write_run(tmp_path, "PointMaze-v0", "abisim", 0, STEPS, returns)
+    with pytest.raises(ValueError, match="no runs of the reference 'ssi' among abisim"):
+        compare([str(tmp_path)], "evaluations", "ssi", [0.5])
+    with pytest.raises(ValueError, match=r"above 0 and up to 1, got \[1\.5\]"):
+        compare([str(tmp_path)], "evaluations", "abisim", [0.5, 1.5])
+    twin = write_run(tmp_path, "PointMaze-v0", "abisim", 0, STEPS, returns)
+    with pytest.raises(ValueError, match="both abisim with seed 0; compare them under names of your own: LABEL=FOLDER"):
+        compare([str(tmp_path)], "evaluations", "abisim", [0.5])
+    twin.rename(tmp_path / "elsewhere")
+    write_run(tmp_path, "PointMaze-v0", "abisim", 1, STEPS, returns, n_timesteps=99)
+    with pytest.raises(ValueError, match="differ in n_timesteps"):
+        compare([str(tmp_path / "ppo")], "evaluations", "abisim", [0.5])
+
+
+def test_a_settings_file_cannot_run_code(tmp_path: Path) -> None:
+    run = write_run(tmp_path, "PointMaze-v0", "abisim", 0, STEPS, np.zeros((len(STEPS), 1)))
+    witness = tmp_path / "witness"
+    (run / "PointMaze-v0" / "args.yml").write_text(f"!!python/object/apply:os.mkdir ['{witness}']")
+    with pytest.raises(ValueError, match=r"cannot read .*args\.yml"):
+        read_run(run)
+    assert not witness.exists()
