@@ -2,6 +2,7 @@
 
 import csv
 import re
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from benchmark_inputs import write_run
 from PIL import Image
 
+from sb3_abisim.benchmark import statistics
 from sb3_abisim.benchmark.__main__ import main
 from sb3_abisim.benchmark.comparison import compare
 from sb3_abisim.benchmark.report import report
@@ -40,6 +42,13 @@ def write_all(folder: Path, env_ids: tuple[str, ...] = ("PointMaze-v0", "Distrac
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_all(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_resamples() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(statistics, "N_RESAMPLES", 200)  # rliable is slow
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +140,11 @@ def test_the_same_runs_give_the_same_files(made: Path, logs: Path, tmp_path: Pat
 
 def test_training_episodes_as_source(tmp_path: Path) -> None:
     run = write_run(tmp_path, "PointMaze-v0", "abisim", 0, STEPS, np.full((len(STEPS), 2), -50.0))
-    lines = ["#{}", "r,l,t,is_success", *(f"{-100 + i},100,{i}.5,{i >= 50}" for i in range(100))]
+    lines = [
+        '#{"t_start": 0, "env_id": "PointMaze-v0"}',
+        "r,l,t,is_success",
+        *(f"{-100 + i},100,{i}.5,{i >= 50}" for i in range(100)),
+    ]
     (run / "0.monitor.csv").write_text("\n".join(lines) + "\n")
     curve = read_run(run).training(n_points=10)
     # 10,000 steps in ten stretches of ten episodes each.

@@ -8,7 +8,13 @@ import pytest
 from sb3_abisim.benchmark import statistics
 
 RNG = np.random.default_rng(5)
+N_RESAMPLES = 200  # rliable is slow
 SCORES = {"a": RNG.uniform(0.4, 1, (5, 3)), "b": RNG.uniform(0, 0.8, (4, 3))}
+
+
+@pytest.fixture(autouse=True)
+def _few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statistics, "N_RESAMPLES", N_RESAMPLES)
 
 
 def test_interval_is_students() -> None:
@@ -41,6 +47,15 @@ def test_a_single_good_evaluation_is_no_arrival() -> None:
     assert statistics.steps_to_threshold(steps, values, 3.0, 800) == 300
     assert np.isnan(statistics.steps_to_threshold(steps, values, 6.0, 600)), "beyond the horizon nothing counts"
     assert np.isnan(statistics.steps_to_threshold(steps, values, 7.5, 800))
+
+
+def test_share_of_wins_is_rliables_metric() -> None:
+    from rliable import metrics
+
+    rounded = {name: scores.round(1) for name, scores in SCORES.items()}  # with ties
+    value = statistics.probability_of_improvement(rounded["a"], {"b": rounded["b"]})["b"][0]
+    assert (rounded["a"][:, None] == rounded["b"]).any()
+    assert value == pytest.approx(metrics.probability_of_improvement(rounded["a"], rounded["b"]))
 
 
 def test_ratio_and_its_bootstrap() -> None:
@@ -117,6 +132,7 @@ def test_intervals_repeat_whatever_the_global_generator_is_at(function) -> None:
     assert np.random.random() == after, "the global generator is left as it was"
 
 
+@pytest.mark.filterwarnings("ignore::FutureWarning")
 def test_rliable_needs_this() -> None:
     """When it honours random_state, `seeded` can go."""
     from rliable import library

@@ -152,10 +152,14 @@ def probability_of_improvement(reference: Floats, baselines: dict[str, Floats], 
     :param seed: of the resamples
     :return: baseline to (value, low, high)
     """
-    from rliable import metrics
-
     pairs: dict[str, Any] = {name: (reference, scores) for name, scores in baselines.items()}
-    return _intervals(pairs, metrics.probability_of_improvement, seed)
+    return _intervals(pairs, _share_of_wins, seed)
+
+
+def _share_of_wins(x: Floats, y: Floats) -> np.floating[Any]:
+    # rliable's metric goes through a Mann-Whitney test for each resample, which takes minutes; the number is the same.
+    wins = np.sign(x[:, None] - y[None]) / 2 + 0.5
+    return wins.mean()  # type: ignore[no-any-return]
 
 
 def performance_profiles(
