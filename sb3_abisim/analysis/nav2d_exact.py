@@ -32,6 +32,7 @@ MIN_SAMPLES = 20
 # Far from the seeds that people type, and from those that a dataset's copies get of its seed.
 HELD_OUT_SEED = 1_000_000
 TOLERANCE = 1e-3
+EMBED_BATCH = 2048
 
 _Y, _X = np.divmod(np.arange(N_CELLS), SIZE)
 _DY, _DX = _Y[None] - _Y[:, None], _X[None] - _X[:, None]
@@ -111,12 +112,16 @@ def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> th.Tensor:
     """Embeddings of frames through SB3's preprocessing, (n, features_dim).
 
     :param encoder: in evaluation mode
-    :param frames: (n, 3, SIZE, SIZE)
+    :param frames: (n, channels, height, width)
     """
-    inputs = preprocess_obs(th.as_tensor(frames), gym.spaces.Box(0, 255, frames.shape[1:], np.uint8))
-    assert isinstance(inputs, th.Tensor)
-    features: th.Tensor = encoder(inputs)
-    return features
+    space = gym.spaces.Box(0, 255, frames.shape[1:], np.uint8)
+    parts = []
+    # Floats of 64 x 64 pictures take 49 kB each.
+    for part in th.as_tensor(frames).split(EMBED_BATCH):
+        inputs = preprocess_obs(part, space)
+        assert isinstance(inputs, th.Tensor)
+        parts.append(encoder(inputs))
+    return th.cat(parts)
 
 
 def learned_maps(encoder: Encoder, layouts: NDArray[np.bool_]) -> Maps:

@@ -103,11 +103,11 @@ _GOAL_BLOCK = _square(_CENTRE - 1, _CENTRE - 1, 1)
 _CORNERS = _corner_choices()
 _START_BLOCKS = _start_blocks()
 
-_WALL_MASK = _unpack(_WALLS)
-_GOAL_MASK = _unpack(_square(_CENTRE - GOAL_MARK_PIXELS // 2, _CENTRE - GOAL_MARK_PIXELS // 2, GOAL_MARK_PIXELS))
+WALL_MASK = _unpack(_WALLS)
+GOAL_MASK = _unpack(_square(_CENTRE - GOAL_MARK_PIXELS // 2, _CENTRE - GOAL_MARK_PIXELS // 2, GOAL_MARK_PIXELS))
 _EMPTY_LAYER = top_down.floor(IMAGE_SIZE)
-top_down.paint(_EMPTY_LAYER, _WALL_MASK, top_down.WALL)
-top_down.paint(_EMPTY_LAYER, _GOAL_MASK, top_down.GOAL)
+top_down.paint(_EMPTY_LAYER, WALL_MASK, top_down.WALL)
+top_down.paint(_EMPTY_LAYER, GOAL_MASK, top_down.GOAL)
 
 
 def _connected(blocks: int, start: int, goal: int) -> bool:
@@ -170,10 +170,13 @@ def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], int,
             return corners, occupied, to_metres(np.array([column + 1, row + 1]) + jitter)
 
 
-def _static_layer(solid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The picture without agent, (3, 64, 64), from where walls and obstacles are."""
+def static_layer(solid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The picture without agent, (3, 64, 64).
+
+    :param solid: where walls and obstacles are, (64, 64)
+    """
     layer = _EMPTY_LAYER.copy()
-    top_down.paint(layer, solid & ~_WALL_MASK, top_down.OBSTACLE)
+    top_down.paint(layer, solid & ~WALL_MASK, top_down.OBSTACLE)
     return layer
 
 
@@ -291,8 +294,8 @@ class PointMazeVectorEnv(BatchEnv):
             self._position[i] = start
             solid = _unpack(occupied)
             self._solid_counts[i, 1:, 1:] = solid.cumsum(axis=0).cumsum(axis=1)
-            self._layers[i] = _static_layer(solid)
-            self._floor[i] = np.where(solid | _GOAL_MASK, 0, 255)
+            self._layers[i] = static_layer(solid)
+            self._floor[i] = np.where(solid | GOAL_MASK, 0, 255)
             self._standing[i] = self._layers[i] & ~self._floor[i]
 
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

@@ -1,0 +1,31 @@
+"""Pretraining curves, read from the cards beside encoder files."""
+
+import json
+from typing import Any
+
+from sb3_abisim.checkpoint import EncoderFile
+
+# What to show of an objective, the first of these that its card has, else the training loss.
+TERMS = ("test/accuracy", "test/metric", "test/loss", "train/loss")
+
+
+def curves(files: dict[str, EncoderFile], env_id: str, _: int = 0) -> dict[str, Any]:
+    """The main curve of each card, and all the others.
+
+    :param files: encoders by name
+    :param env_id: for the title
+    :return: per encoder: ``objective``, ``term`` (which curve is the main one) and ``curves`` (all of the card)
+    :raises ValueError: for an encoder without card
+    """
+    encoders = {}
+    for name, file in files.items():
+        path = file.path.with_suffix(".json")
+        if not path.is_file():
+            raise ValueError(f"{name} has no card {path}, which holds the curves; copy it there as well")
+        all_curves = json.loads(path.read_text())["curves"]
+        term = next((term for term in TERMS if term in all_curves), None)
+        if term is None:
+            raise ValueError(f"the card {path} holds none of the curves {', '.join(TERMS)}")
+        origin = {"digest": file.digest, "objective": file.contract["objective"]}
+        encoders[name] = {**origin, "term": term, "curves": all_curves}
+    return {"encoders": encoders}

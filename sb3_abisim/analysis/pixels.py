@@ -1,0 +1,168 @@
+"""Perturbations in pixel space: point mazes drawn again from changed simulator states.
+
+One obstacle is moved by a metre and all else stays: agent, other obstacles and, in Distractor PointMaze, the frame of
+the clip behind them. For comparison the agent is moved by as much, the state is replaced by another one, and (Distractor
+PointMaze) the clip is swapped under the same state. Clips are those that no encoder was trained on.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from sb3_abisim.analysis.nav2d_exact import embed
+from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, sample_episodes
+from sb3_abisim.checkpoint import EncoderFile
+from sb3_abisim.envs.backgrounds import load_backgrounds
+from sb3_abisim.envs.point_maze import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE, ROOM_SIZE
+from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS
+
+ENV_IDS = ("PointMaze-v0", "ContinuousPointMaze-v0", "DistractorPointMaze-v0", "ContinuousDistractorPointMaze-v0")
+STEP = 1.0  # m, how far an obstacle or the agent is moved
+# Distances in metres from the agent's centre to the nearest edge of the obstacle, before or after the move.
+BINS = ((0.0, 0.6), (0.6, 1.2), (1.2, 2.0), (2.0, 3.0), (3.0, 5.0), (5.0, 15.0))
+MAP_REACH = 8  # m
+MIN_SAMPLES = 5
+
+_HALF = OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
+
+
+def has_clips(env_id: str) -> bool:
+    """Whether the floor of an environment shows clips.
+
+    :param env_id: a registered id of ours
+    """
+    return "Distractor" in env_id
+
+
+def unseen_clips(env_id: str) -> dict[str, Any]:
+    """Keyword arguments with which an environment shows clips that pretraining has not seen.
+
+    :param env_id: a registered id of ours
+    """
+    return {"split": "eval"} if has_clips(env_id) else {}
+
+
+def backgrounds_of(samples: Samples, env_id: str) -> NDArray[np.uint8] | None:
+    """The clip frames behind samples of unseen clips, uint8 (n, 3, 64, 64); None where there are none.
+
+    :param samples: with the environment arguments of :func:`unseen_clips`
+    :param env_id: a registered id of ours
+    """
+    if not has_clips(env_id):
+        return None
+    return load_backgrounds(None, "eval").frames(samples.factors["clip"], samples.factors["frame"])
+
+
+def swapped_backgrounds(samples: Samples, generator: np.random.Generator) -> NDArray[np.uint8]:
+    """Frames of another unseen clip for each sample, uint8 (n, 3, 64, 64).
+
+    :param samples: of an environment with clips
+    :param generator: draws clip and frame
+    """
+    clips = load_backgrounds(None, "eval")
+    clip = (samples.factors["clip"] + generator.integers(1, clips.n_clips, size=len(samples))) % clips.n_clips
+    return clips.frames(clip, generator.integers(0, clips.lengths[clip]))
+
+
+def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: int = 0) -> dict[str, Any]:
+    """Mean change of the embedding by where the moved obstacle is, and what other changes do.
+
+    :param files: encoders by name
+    :param env_id: one of the point mazes
+    :param n_states: agents, each in a layout of its own
+    :param seed: of the choices
+    :return: per encoder, in units of the mean distance between two states on the same background: ``map`` by offset
+        [dy, dx] in metres from agent to obstacle, ``profile`` by distance (:data:`BINS`), ``agent``, and ``clip``
+        (None without clips)
+    :raises ValueError: for an environment without pixels of this kind
+    """
+    if env_id not in ENV_IDS:
+        raise ValueError(f"obstacles can be moved in {', '.join(ENV_IDS)}, got {env_id!r}")
+    samples = sample_episodes(env_id, n_states, 1, seed, unseen_clips(env_id))
+    generator = np.random.default_rng(seed)
+    agents, obstacles = samples.factors["agent"].astype(np.float64), samples.factors["obstacles"].astype(np.float64)
+    behind = backgrounds_of(samples, env_id)
+    here = draw_point_mazes(agents, obstacles, behind)
+    moves = _moves(agents, obstacles, generator)
+    index, gap = moves["state"], moves["gap"]
+    moved = draw_point_mazes(agents[index], moves["obstacles"], None if behind is None else behind[index])
+    others = generator.permutation(len(samples))
+    others = np.where(others == np.arange(len(samples)), (others + 1) % len(samples), others)
+    different = draw_point_mazes(agents[others], obstacles[others], behind)
+    nudged, who = _nudged(agents, obstacles, behind, generator)
+    encoders = {}
+    for name, file in files.items():
+        features = embed(file.encoder.eval(), here)
+        unit = float(_l1(features, embed(file.encoder, different)).mean())
+        change = (_l1(features[th.as_tensor(index)], embed(file.encoder, moved)) / unit).numpy()
+        encoders[name] = {
+            "digest": file.digest,
+            "map": _offset_map(moves["offset"], change).tolist(),
+            "profile": [float(change[(low <= gap) & (gap < high)].mean()) for low, high in BINS],
+            "agent": float(_l1(features[th.as_tensor(who)], embed(file.encoder, nudged)).mean()) / unit,
+            "clip": None,
+        }
+        if behind is not None:
+            swapped = draw_point_mazes(agents, obstacles, swapped_backgrounds(samples, np.random.default_rng(seed)))
+            encoders[name]["clip"] = float(_l1(features, embed(file.encoder, swapped)).mean()) / unit
+    return {"bins": BINS, "n_moves": len(index), "reach": MAP_REACH, "encoders": encoders}
+
+
+def _l1(x: th.Tensor, y: th.Tensor) -> th.Tensor:
+    return (x - y).abs().sum(dim=1)
+
+
+def _edge_distance(agents: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From a point to the nearest point of a square obstacle, 0 inside; shapes (n, 2) to (n,)."""
+    outside = np.maximum(np.abs(centres - agents) - _HALF, 0.0)
+    return np.hypot(outside[:, 0], outside[:, 1])
+
+
+def _moves(
+    agents: NDArray[np.float64], obstacles: NDArray[np.float64], generator: np.random.Generator
+) -> dict[str, NDArray[Any]]:
+    """Every obstacle of every state moved in a direction drawn at random, where that is a possible state.
+
+    An obstacle may touch neither the agent's disc nor the goal, nor leave the room.
+    """
+    n_states, n_obstacles = obstacles.shape[:2]
+    state, which = (array.ravel() for array in np.indices((n_states, n_obstacles)))
+    old = obstacles[state, which]
+    new = old + STEP * DIRECTIONS[generator.integers(len(DIRECTIONS), size=len(old))]
+    agent = agents[state]
+    gap = np.minimum(_edge_distance(agent, old), _edge_distance(agent, new))
+    possible = (_edge_distance(agent, new) > AGENT_RADIUS) & (np.abs(new).max(axis=1) <= ROOM_SIZE / 2 - _HALF)
+    possible &= np.abs(new).max(axis=1) >= GOAL_RADIUS + _HALF
+    layouts = obstacles[state]
+    layouts[np.arange(len(state)), which] = new
+    result = {"state": state, "obstacles": layouts, "gap": gap, "offset": (old + new) / 2 - agent}
+    return {name: array[possible] for name, array in result.items()}
+
+
+def _nudged(
+    agents: NDArray[np.float64],
+    obstacles: NDArray[np.float64],
+    behind: NDArray[np.uint8] | None,
+    generator: np.random.Generator,
+) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Pictures with the agent moved by a step over free floor, and the states they belong to."""
+    new = agents + STEP * DIRECTIONS[generator.integers(len(DIRECTIONS), size=len(agents))]
+    free = np.abs(new).max(axis=1) <= ROOM_SIZE / 2 - AGENT_RADIUS
+    for k in range(obstacles.shape[1]):
+        free &= _edge_distance(new, obstacles[:, k]) > AGENT_RADIUS
+    who = np.flatnonzero(free)
+    return draw_point_mazes(new[who], obstacles[who], None if behind is None else behind[who]), who
+
+
+def _offset_map(offsets: NDArray[np.float64], values: NDArray[Any]) -> NDArray[np.float64]:
+    """Mean by offset in bins of a metre, [dy, dx] from -MAP_REACH to MAP_REACH; NaN for rare offsets."""
+    bins = np.rint(offsets).astype(np.int64) + MAP_REACH
+    side = 2 * MAP_REACH + 1
+    inside = ((bins >= 0) & (bins < side)).all(axis=1)
+    flat = bins[inside, 1] * side + bins[inside, 0]
+    counts = np.bincount(flat, minlength=side**2)
+    sums = np.bincount(flat, weights=values[inside], minlength=side**2)
+    means: NDArray[np.float64] = np.divide(sums, counts, out=np.full(side**2, np.nan), where=counts >= MIN_SAMPLES)
+    return means.reshape(side, side)

@@ -1,0 +1,146 @@
+"""More figures: pixel space, neighbours, probes, curves and the leak audit. Needs the extra ``plots``."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_abisim.analysis.plots import CMAP, _array, _pyplot, _save, _show_map, _show_profiles, short_name
+from sb3_abisim.analysis.probes import PROBES
+
+
+def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
+    """Maps of a moved obstacle, profiles by distance, and what other changes do.
+
+    :param results: of :func:`~sb3_abisim.analysis.pixels.pixel_maps`
+    :param path: the PNG
+    """
+    plt = _pyplot()
+    encoders = results["encoders"]
+    n = len(encoders)
+    figure, axes = plt.subplots(1, n + 2, figsize=(3.0 * (n + 2) + 0.6, 3.4), constrained_layout=True)
+    for axis, (name, result) in zip(axes, encoders.items(), strict=False):
+        image = _show_map(axis, _array(result["map"]), short_name(name), results["reach"], "metres")
+    figure.colorbar(image, ax=list(axes[:n]), shrink=0.8, label="relative to the largest")
+    lines = {short_name(name): result["profile"] for name, result in encoders.items()}
+    _show_profiles(axes[n], lines, results["bins"], "m from agent to obstacle")
+    axes[n].tick_params(axis="x", rotation=30)
+    changes = {"obstacle\nwithin 0.6 m": lambda r: r["profile"][0], "agent\n1 m": lambda r: r["agent"]}
+    if next(iter(encoders.values()))["clip"] is not None:
+        changes["clip"] = lambda r: r["clip"]
+    width = 0.8 / n
+    for k, (name, result) in enumerate(encoders.items()):
+        heights = [value(result) for value in changes.values()]
+        axes[n + 1].bar(np.arange(len(changes)) + (k - (n - 1) / 2) * width, heights, width, label=short_name(name))
+    axes[n + 1].set_xticks(range(len(changes)), changes, fontsize=8)
+    axes[n + 1].set_ylabel("change (1: another state)")
+    axes[n + 1].legend(fontsize=7)
+    figure.suptitle(f"Change of the embedding when one obstacle moves by 1 m, {results['env_id']}", fontsize=10)
+    _save(figure, path)
+
+
+def draw_neighbours(results: dict[str, Any], path: Path) -> None:
+    """Queries in the first row, each encoder's nearest neighbours below with their distances.
+
+    :param results: of :func:`~sb3_abisim.analysis.neighbours.neighbours`
+    :param path: the PNG
+    """
+    plt = _pyplot()
+    pictures, encoders = results["pictures"], results["encoders"]
+    n = len(pictures["query"])
+    figure, axes = plt.subplots(
+        len(pictures), n, figsize=(1.5 * n + 0.6, 1.9 * len(pictures) + 0.5), constrained_layout=True, squeeze=False
+    )
+    for row, (name, frames) in zip(axes, pictures.items(), strict=True):
+        for k, (axis, frame) in enumerate(zip(row, frames, strict=True)):
+            axis.imshow(frame.transpose(1, 2, 0))
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if name in encoders:
+                example = encoders[name]["examples"]
+                same = "" if example["same_clip"] is None else (", same clip" if example["same_clip"][k] else "")
+                words = f"d {example['distance'][k]:.2f}, agent {example['agent'][k]:.1f}{same}"
+                axis.set_title(words, fontsize=7)
+        row[0].set_ylabel(short_name(name), fontsize=8)
+    figure.suptitle(
+        f"Nearest states of other episodes, {results['env_id']} (d: distance of embeddings, 1 is the mean of all "
+        "neighbours; agent: distance of the agents)",
+        fontsize=8,
+    )
+    _save(figure, path)
+
+
+def draw_probes(results: dict[str, Any], path: Path) -> None:
+    """Bars of every probe's score with confidence intervals where there are several seeds.
+
+    :param results: of :func:`~sb3_abisim.analysis.probes.probes`
+    :param path: the PNG
+    """
+    plt = _pyplot()
+    groups = results["groups"]
+    settings = next(iter(groups.values()))["scores"]
+    n = len(settings)
+    figure, axes = plt.subplots(1, n, figsize=(5.6 * n, 3.4), constrained_layout=True, squeeze=False)
+    width = 0.8 / (len(groups) * len(PROBES))
+    for axis, (setting, names) in zip(axes[0], settings.items(), strict=True):
+        for k, (objective, group) in enumerate(groups.items()):
+            for j, kind in enumerate(PROBES):
+                cells = [group["scores"][setting][target][kind] for target in names]
+                heights = [np.nan if cell is None else max(cell[0], -0.2) for cell in cells]
+                errors = [0.0 if cell is None or cell[1] is None else cell[1] for cell in cells]
+                place = np.arange(len(names)) + (k * len(PROBES) + j - (len(groups) * len(PROBES) - 1) / 2) * width
+                style = {"color": f"C{k}", "alpha": 0.5 if kind == "linear" else 1.0, "label": f"{objective}, {kind}"}
+                axis.bar(place, heights, width, yerr=errors if any(errors) else None, **style)
+        axis.set_xticks(range(len(names)), names)
+        axis.set_title(setting, fontsize=9)
+        axis.set_ylim(-0.2, 1.05)
+        axis.grid(axis="y", alpha=0.3)
+    axes[0, 0].set_ylabel("score (R², AUC, accuracy)")
+    axes[0, 0].legend(fontsize=7)
+    figure.suptitle(f"What probes read from the embedding, {results['env_id']}", fontsize=10)
+    _save(figure, path)
+
+
+def draw_curves(results: dict[str, Any], path: Path) -> None:
+    """The main pretraining curve of each encoder.
+
+    :param results: of :func:`~sb3_abisim.analysis.curves.curves`
+    :param path: the PNG
+    """
+    plt = _pyplot()
+    encoders = results["encoders"]
+    n = len(encoders)
+    figure, axes = plt.subplots(1, n, figsize=(3.6 * n, 2.9), constrained_layout=True, squeeze=False)
+    for axis, (name, result) in zip(axes[0], encoders.items(), strict=True):
+        term = result["term"]
+        for part in ("test", "train"):
+            key = f"{part}/{term.split('/')[1]}"
+            if key in result["curves"]:
+                label = "held-out episodes" if part == "test" else "training"
+                axis.plot(result["curves"]["n_updates"], result["curves"][key], marker=".", label=label)
+        axis.set(xlabel="updates", ylabel=term.split("/")[1])
+        axis.set_title(short_name(name), fontsize=9)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7)
+    figure.suptitle("Pretraining", fontsize=10)
+    _save(figure, path)
+
+
+def draw_leak(results: dict[str, Any], path: Path) -> None:
+    """What each patch tells about the action, by itself.
+
+    :param results: of :func:`~sb3_abisim.analysis.leak.leak_maps`
+    :param path: the PNG
+    """
+    plt = _pyplot()
+    audits = results["audits"]
+    figure, axes = plt.subplots(1, len(audits), figsize=(3.6 * len(audits), 3.4), constrained_layout=True)
+    for axis, (name, one) in zip(axes, audits.items(), strict=True):
+        image = axis.imshow(_array(one["scores"]), cmap=CMAP, vmin=0, vmax=1)
+        verdict = "leak" if one["leaks"] else "no leak"
+        axis.set_title(f"{name}\n{verdict}, best patch {np.max(one['scores']):.2f}", fontsize=9)
+        axis.set_xticks([])
+        axis.set_yticks([])
+    figure.colorbar(image, ax=list(axes), shrink=0.8, label="score of one patch alone")
+    figure.suptitle(f"Can the action be read from few pixels? {results['env_id']}", fontsize=10)
+    _save(figure, path)

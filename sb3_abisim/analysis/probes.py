@@ -1,0 +1,275 @@
+"""Probes: what can be read from an embedding, by a ridge regression and by a small network.
+
+Probes learn from frames of some layouts and are tested on frames of others, in two settings where the environment
+shows clips: on the clips of pretraining, and on unseen ones. Agent and surroundings are always learned on the clips of
+pretraining; clip and phase can only be read by a probe that knows the clip, so those are learned on the tested side's
+own clips (in other layouts). Targets are continuous (scored by the coefficient of determination), yes or no (area
+under the ROC curve, mean over the points around the agent) or classes (share of correct answers).
+"""
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from sb3_abisim.analysis.nav2d_exact import embed
+from sb3_abisim.analysis.pixels import backgrounds_of, has_clips, swapped_backgrounds, unseen_clips
+from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, local_obstacles, sample_episodes
+from sb3_abisim.checkpoint import EncoderFile
+from sb3_abisim.envs.backgrounds import SPLITS, Backgrounds, load_backgrounds
+from sb3_abisim.networks import Encoder, make_encoder
+
+PER_EPISODE = 10
+PROBES = ("linear", "MLP")
+HIDDEN = 64
+ALPHAS = tuple(10.0**k for k in range(-2, 5))
+UNTRAINED = "untrained"
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something to read.
+
+    :param values: (n, n_outputs), floats for "continuous", 0 and 1 for "binary" and "classes" (one-hot)
+    :param kind: "continuous", "binary" or "classes"
+    """
+
+    values: NDArray[np.float64]
+    kind: str
+
+    def score(self, predictions: NDArray[np.float64]) -> float | None:
+        """R^2, mean area under the ROC curve, or accuracy; None where the target does not vary.
+
+        :param predictions: as ``values``
+        """
+        from sklearn.metrics import r2_score, roc_auc_score
+
+        varies = self.values.std(axis=0) > 0
+        if not varies.any():
+            return None
+        values, predictions = self.values[:, varies], predictions[:, varies]
+        if self.kind == "continuous":
+            return float(r2_score(values, predictions))
+        if self.kind == "binary":
+            return float(roc_auc_score(values, predictions, average="macro"))
+        return float((values.argmax(axis=1) == predictions.argmax(axis=1)).mean())
+
+
+def targets(samples: Samples) -> dict[str, Target]:
+    """What is to be read from a picture; goals that never move and clips that are not shown are left out.
+
+    :param samples: with factors
+    """
+    factors = samples.factors
+    found = {
+        "agent": Target(factors["agent"].astype(np.float64), "continuous"),
+        "obstacles": Target(local_obstacles(factors).astype(np.float64), "binary"),
+    }
+    if "goal" in factors and factors["goal"].std(axis=0).max() > 0:
+        found["goal"] = Target(factors["goal"].astype(np.float64), "continuous")
+    if "clip" in factors and factors["clip"].max() >= 0:
+        # All clips of the side, in its order, so that classes are the same in every sample.
+        (clips,) = (side for side in map(_clips, SPLITS) if np.isin(factors["clip_id"], side.clip_ids).all())
+        found["clip"] = Target((factors["clip_id"][:, None] == clips.clip_ids).astype(np.float64), "classes")
+        found["phase"] = Target((factors["frame"] / (clips.lengths[factors["clip"]] - 1))[:, None], "continuous")
+    return found
+
+
+def _clips(split: str) -> Backgrounds:
+    return load_backgrounds(None, split)
+
+
+def make_probe(kind: str) -> Any:
+    """A scikit-learn regressor on standardised inputs.
+
+    :param kind: one of :data:`PROBES`
+    """
+    from sklearn.linear_model import RidgeCV
+    from sklearn.neural_network import MLPRegressor
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    if kind == "linear":
+        return make_pipeline(StandardScaler(), RidgeCV(ALPHAS))
+    return make_pipeline(StandardScaler(), MLPRegressor((HIDDEN,), early_stopping=True, max_iter=300, random_state=0))
+
+
+def read(
+    kind: str, features: NDArray[Any], target: Target, test_features: NDArray[Any], test_target: Target
+) -> float | None:
+    """Train a probe and score it.
+
+    :param kind: one of :data:`PROBES`
+    :param features: (n, features_dim)
+    :param target: to learn
+    :param test_features: of other layouts, (m, features_dim)
+    :param test_target: to score
+    :return: see :meth:`Target.score`
+    """
+    mean, std = target.values.mean(axis=0), target.values.std(axis=0)
+    # Classes and yes-or-no answers are learned by least squares as well; their scores are of ranks.
+    scale = np.where(std > 0, std, 1.0) if target.kind == "continuous" else np.ones_like(std)
+    probe = make_probe(kind)
+    wanted = (target.values - mean) / scale
+    with warnings.catch_warnings():
+        # A network that stops at the limit of its epochs is a result, too.
+        warnings.simplefilter("ignore")
+        probe.fit(features, wanted[:, 0] if wanted.shape[1] == 1 else wanted)
+    predictions = np.asarray(probe.predict(test_features)).reshape(len(test_features), -1)
+    return test_target.score(predictions * scale + mean)
+
+
+def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
+    """The whole table of an environment, with an untrained encoder for comparison.
+
+    :param files: encoders by name
+    :param env_id: a registered id of ours
+    :param n_episodes: to learn from, and as many again for each test
+    :param seed: of the episodes and the untrained weights
+    :return: per encoder: objective, seed, ``scores`` by setting ("held-out layouts", and "unseen clips"), target and
+        probe, and ``invariance`` (:func:`invariance_ratio`; None without clips)
+    """
+    settings = {"held-out layouts": {}} | ({"unseen clips": unseen_clips(env_id)} if has_clips(env_id) else {})
+    learn, test = (
+        {name: sample_episodes(env_id, n_episodes, PER_EPISODE, 2 * seed + k, kw) for name, kw in settings.items()}
+        for k in (1, 2)
+    )
+    pictures = next(iter(learn.values())).frames
+    th.manual_seed(seed)
+    encoders: dict[str, tuple[Encoder, dict[str, Any]]] = {
+        name: (file.encoder.eval(), {"digest": file.digest, **_origin(file)}) for name, file in files.items()
+    }
+    untrained = make_encoder(_space_of(pictures)).eval()
+    encoders[UNTRAINED] = (untrained, {"digest": None, "objective": UNTRAINED, "seed": seed})
+    results = {}
+    for name, (encoder, origin) in encoders.items():
+        scores = {setting: _scores(encoder, learn, test, setting) for setting in settings}
+        ratio = invariance_ratio(encoder, test["unseen clips"], env_id) if has_clips(env_id) else None
+        results[name] = {**origin, "scores": scores, "invariance": ratio}
+    return {"n_frames": len(pictures), "encoders": results, "groups": by_objective(results)}
+
+
+def _space_of(frames: NDArray[np.uint8]) -> Any:
+    from gymnasium.spaces import Box
+
+    return Box(0, 255, frames.shape[1:], np.uint8)
+
+
+def _origin(file: EncoderFile) -> dict[str, Any]:
+    return {"objective": file.contract["objective"], "seed": file.contract["settings"].get("seed")}
+
+
+def _scores(encoder: Encoder, learn: dict[str, Samples], test: dict[str, Samples], setting: str) -> dict[str, Any]:
+    """Target and probe to score in one setting."""
+    embedded: dict[int, NDArray[Any]] = {}
+
+    def features(samples: Samples) -> NDArray[Any]:
+        if id(samples) not in embedded:
+            embedded[id(samples)] = embed(encoder, samples.frames).numpy()
+        return embedded[id(samples)]
+
+    scores = {}
+    for name, tested in targets(test[setting]).items():
+        source = learn[setting] if name in ("clip", "phase") else next(iter(learn.values()))
+        learned = targets(source)[name]
+        scores[name] = {kind: read(kind, features(source), learned, features(test[setting]), tested) for kind in PROBES}
+    return scores
+
+
+def invariance_ratio(encoder: Encoder, samples: Samples, env_id: str, seed: int = 0) -> float:
+    """Distance between the same state on two clips, over the distance between different states on the same clip.
+
+    0 is an encoder that does not see the background, 1 one for which a new clip is as much as a new state.
+
+    :param encoder: in evaluation mode
+    :param samples: with the environment arguments of :func:`~sb3_abisim.analysis.pixels.unseen_clips`
+    :param env_id: an environment with clips
+    :param seed: of the choices
+    """
+    generator = np.random.default_rng(seed)
+    agents, obstacles = samples.factors["agent"], samples.factors["obstacles"]
+    behind = backgrounds_of(samples, env_id)
+    others = np.roll(np.arange(len(samples)), PER_EPISODE)
+    here = embed(encoder, draw_point_mazes(agents, obstacles, behind))
+    elsewhere = embed(encoder, draw_point_mazes(agents[others], obstacles[others], behind))
+    swapped = embed(encoder, draw_point_mazes(agents, obstacles, swapped_backgrounds(samples, generator)))
+    return float((here - swapped).abs().sum(dim=1).mean() / (here - elsewhere).abs().sum(dim=1).mean())
+
+
+def by_objective(results: dict[str, Any]) -> dict[str, Any]:
+    """Mean over pretraining seeds, with the half width of its 95 % confidence interval (Student's t).
+
+    :param results: per encoder, as in :func:`probes`
+    :return: per objective: ``n_seeds``, ``scores`` as there with ``(mean, half width)`` for each number (the half width
+        None for one seed), and ``invariance`` likewise
+    :raises ValueError: if two encoders have the same objective and seed: they differ in something else
+    """
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for result in results.values():
+        groups.setdefault(result["objective"], []).append(result)
+    summary = {}
+    for objective, members in groups.items():
+        seeds = [member["seed"] for member in members]
+        if len(set(seeds)) < len(seeds):
+            raise ValueError(
+                f"two {objective} encoders with the same seed (seeds {seeds}): intervals are over pretraining seeds, "
+                "so give encoders that differ in nothing else"
+            )
+        scores = {
+            setting: {
+                target: {
+                    kind: mean_interval([member["scores"][setting][target][kind] for member in members])
+                    for kind in PROBES
+                }
+                for target in members[0]["scores"][setting]
+            }
+            for setting in members[0]["scores"]
+        }
+        ratio = mean_interval([member["invariance"] for member in members])
+        summary[objective] = {"n_seeds": len(members), "scores": scores, "invariance": ratio}
+    return summary
+
+
+def mean_interval(values: list[float | None]) -> tuple[float, float | None] | None:
+    """Mean and half width of its 95 % confidence interval; the latter None for one value, all None without values.
+
+    :param values: one per seed
+    """
+    numbers = [value for value in values if value is not None]
+    if not numbers:
+        return None
+    if len(numbers) == 1:
+        return numbers[0], None
+    from scipy.stats import t
+
+    half = t.ppf(0.975, len(numbers) - 1) * np.std(numbers, ddof=1) / np.sqrt(len(numbers))
+    return float(np.mean(numbers)), float(half)
+
+
+def table(results: dict[str, Any]) -> str:
+    """The results of :func:`probes` as a Markdown table, ``linear / MLP`` in each cell.
+
+    :param results: what it returned
+    """
+    first = next(iter(results["groups"].values()))
+    columns = [(setting, target) for setting, scores in first["scores"].items() for target in scores]
+    clips = first["invariance"] is not None
+    header = ["encoder", "seeds", *(f"{target}, {setting}" for setting, target in columns)]
+    header += ["invariance ratio"] if clips else []
+    rows = [header, ["---", *["---:"] * (len(header) - 1)]]
+    for objective, group in results["groups"].items():
+        cells = [group["scores"][setting][target] for setting, target in columns]
+        words = [" / ".join(_number(cell[kind]) for kind in PROBES) for cell in cells]
+        row = [objective, str(group["n_seeds"]), *words]
+        rows.append(row + ([_number(group["invariance"])] if clips else []))
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def _number(value: tuple[float, float | None] | None) -> str:
+    if value is None:
+        return "-"
+    mean, half = value
+    return f"{mean:.3f}" if half is None else f"{mean:.3f} ± {half:.3f}"

@@ -1,0 +1,41 @@
+"""Encoders trained for one figure: action-bisimulation on Nav2D with several weights c of the recursive term."""
+
+from pathlib import Path
+
+from sb3_abisim.checkpoint import EncoderFile, load_encoder
+from sb3_abisim.pretrain import pretrain, read_env_id
+from sb3_abisim.pretrain_config import load_config
+
+PAPER_C = (0.25, 0.75, 0.85, 0.99)
+N_UPDATES = 2000
+
+
+def sweep_encoders(
+    values: list[float], base: str, folder: Path, data: Path | None, env_id: str, n_updates: int = N_UPDATES
+) -> dict[float, EncoderFile]:
+    """The encoders of a sweep; those that ``folder`` does not hold are pretrained first, four minutes each on one core.
+
+    :param values: of c, each in [0, 1)
+    :param base: file or name of the base encoder
+    :param folder: holds ``abisim_c<c>.safetensors``
+    :param data: dataset to pretrain on, needed for what is missing
+    :param env_id: environment of the dataset
+    :param n_updates: of each pretraining
+    :raises ValueError: for missing encoders without data, or data of another environment
+    """
+    files = {}
+    for c in values:
+        path = folder / f"abisim_c{c:g}.safetensors"
+        if not path.is_file():
+            if data is None:
+                raise ValueError(f"{path} is not there; give --data DIR, a dataset of {env_id}, to pretrain it")
+            if (found := read_env_id(data)) != env_id:
+                raise ValueError(f"{data} was collected in {found}, not in {env_id}")
+            folder.mkdir(parents=True, exist_ok=True)
+            config = load_config("abisim", env_id, {"objective_kwargs.c": c, "n_updates": n_updates})
+            pretrain("abisim", data, path, config, base, device="cpu", verbose=0)
+        files[c] = load_encoder(path)
+        found_c = files[c].contract["settings"]["objective_kwargs"].get("c")
+        if found_c != c:
+            raise ValueError(f"{path} was trained with c = {found_c}, its name says {c:g}; rename or remove it")
+    return files
