@@ -1,7 +1,8 @@
-"""What an encoder sees, as numbers: ``python -m sb3_abisim.analyze exact ...``.
+"""What an encoder sees, as figures and numbers: ``python -m sb3_abisim.analyze COMMAND ...``.
 
 ``exact`` holds encoders of Nav2D against the exact action-bisimulation metric
-(:mod:`sb3_abisim.analysis.nav2d_exact`).
+(:mod:`sb3_abisim.analysis.nav2d_exact`). Every other command is a figure of :mod:`sb3_abisim.analysis.figures`: a
+PNG, and its numbers as JSON. ``all`` makes every figure.
 """
 
 import argparse
@@ -12,9 +13,18 @@ from typing import Any
 
 import gymnasium as gym
 
+from sb3_abisim.analysis import probes
+from sb3_abisim.analysis.figures import FIGURES, default_encoders, load_all, make_figure, make_sweep
 from sb3_abisim.analysis.nav2d_exact import BINS, ENV_IDS, HELD_OUT_SEED, ExactReference
+from sb3_abisim.analysis.sweep import PAPER_C
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.checkpoint import EncoderFile, load_encoder
+
+SWEEP_LAYOUTS = 2
+ENCODERS_HELP = {
+    False: "files or names (default: all that ship for the environment)",
+    True: "files or names (default: all that ship for the environment, and those in TRAINED/<env id>)",
+}
 
 
 def exact(
@@ -65,8 +75,38 @@ def table(results: dict[str, Any]) -> str:
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
+def figure(args: argparse.Namespace) -> None:
+    """Make one figure.
+
+    :param args: of a figure's command
+    """
+    one = FIGURES[args.command]
+    files = {}
+    if one.encoders:
+        trained = args.trained if one.trained else None
+        files = load_all(args.encoders or default_encoders(args.env, trained), args.env)
+    path = make_figure(args.command, files, args.env, args.n, args.images, args.numbers or args.images)
+    if args.command == "probes":
+        print(probes.table(json.loads(((args.numbers or args.images) / f"{path.stem}.json").read_text())))
+    print(path)
+
+
+def all_figures(args: argparse.Namespace) -> None:
+    """Make every figure with its default encoders, the sweep first since it may need data.
+
+    :param args: of the command ``all``
+    """
+    commands = [["sweep", "-n", str(args.n or SWEEP_LAYOUTS), *(["--data", str(args.data)] if args.data else [])]]
+    for name, one in FIGURES.items():
+        commands += [[name, "--env", env_id, "-n", str(args.n or one.size)] for env_id in one.usual_ids]
+    folders = ["--images", str(args.images), "--numbers", str(args.numbers or args.images)]
+    for words in commands:
+        print(f"$ python -m sb3_abisim.analyze {' '.join(words)}", flush=True)
+        main([*words, *folders, "--trained", str(args.trained)])
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("python -m sb3_abisim.analyze", description="What an encoder sees, as numbers.")
+    parser = argparse.ArgumentParser("python -m sb3_abisim.analyze", description="What an encoder sees.")
     commands = parser.add_subparsers(dest="command", required=True)
     command = commands.add_parser("exact", help="hold encoders of Nav2D against the exact metric")
     command.add_argument("encoders", nargs="+", metavar="ENCODER", help="encoder files or names")
@@ -76,7 +116,33 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--n-layouts", type=int, default=10, help="six seconds each (default: %(default)s)")
     command.add_argument("--seed", type=int, default=HELD_OUT_SEED, help="of the first layout (default: %(default)s)")
     command.add_argument("-o", "--output", metavar="FILE", help="write the numbers there as JSON")
+    for name, one in FIGURES.items():
+        command = commands.add_parser(name, help=one.help)
+        if one.encoders:
+            command.add_argument("encoders", nargs="*", metavar="ENCODER", help=ENCODERS_HELP[one.trained])
+        command.add_argument("--env", default=one.env_ids[0], choices=one.env_ids)
+        command.add_argument("-n", type=int, default=one.size, help=f"{one.unit} (default: %(default)s)")
+        _add_folders(command)
+    command = commands.add_parser("sweep", help="perturbation maps on Nav2D over c, beside the exact metric's")
+    command.add_argument("-c", type=float, nargs="+", default=list(PAPER_C), help="(default: those of the paper)")
+    command.add_argument("--base", default="Nav2D-v0/ssi", help="single-step encoder (default: %(default)s)")
+    command.add_argument("--data", type=Path, metavar="DIR", help="dataset for what is not in TRAINED/c_sweep")
+    command.add_argument("-n", type=int, default=SWEEP_LAYOUTS, help="layouts (default: %(default)s)")
+    _add_folders(command)
+    command = commands.add_parser("all", help="every figure, with the default encoders")
+    command.add_argument("--data", type=Path, metavar="DIR", help="dataset of Nav2D-v0, see sweep")
+    command.add_argument("-n", type=int, help="one size for all of them, for a quick look")
+    _add_folders(command)
     return parser
+
+
+def _add_folders(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--images", type=Path, default="figures", metavar="DIR", help="PNGs (default: %(default)s)")
+    command.add_argument("--numbers", type=Path, metavar="DIR", help="JSON (default: the folder of the PNGs)")
+    command.add_argument(
+        "--trained", type=Path, metavar="TRAINED", default="benchmarks/encoders",
+        help="encoders trained for figures: <env id>/*.safetensors, and c_sweep (default: %(default)s)",
+    )  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -87,9 +153,21 @@ def main(argv: list[str] | None = None) -> None:
     parser = _parser()
     args = parser.parse_args(argv)
     try:
-        results = exact(args.encoders, args.base, args.c, args.env, args.n_layouts, args.seed)
+        if args.command == "exact":
+            _exact_command(args)
+        elif args.command == "all":
+            all_figures(args)
+        elif args.command == "sweep":
+            folders = (args.images, args.numbers or args.images)
+            print(make_sweep(args.c, args.base, args.trained / "c_sweep", args.data, args.n, *folders))
+        else:
+            figure(args)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
+
+
+def _exact_command(args: argparse.Namespace) -> None:
+    results = exact(args.encoders, args.base, args.c, args.env, args.n_layouts, args.seed)
     print(table(results))
     if args.output is not None:
         text = json.dumps(results, indent=1) + "\n"

@@ -9,11 +9,10 @@ from sb3_abisim.checkpoint import EncoderFile
 TERMS = ("test/accuracy", "test/metric", "test/loss", "train/loss")
 
 
-def curves(files: dict[str, EncoderFile], env_id: str, _: int = 0) -> dict[str, Any]:
+def curves(files: dict[str, EncoderFile]) -> dict[str, Any]:
     """The main curve of each card, and all the others.
 
     :param files: encoders by name
-    :param env_id: for the title
     :return: per encoder: ``objective``, ``term`` (which curve is the main one) and ``curves`` (all of the card)
     :raises ValueError: for an encoder without card
     """

@@ -1,10 +1,10 @@
 """Can the action be read from a few pixels?
 
 An inverse model that finds such pixels need look at nothing else, and its encoder then knows nothing else: the paper's
-example is a small display of the last action. The audit gives each small patch of the picture, before and after the step,
-to a decision tree that predicts the action. A patch through which an agent passes now and then tells little; a patch
-that tells half of what there is to know, by itself, is a leak. The audit looks at data, not at an encoder: it can be
-run before pretraining.
+example is a small display of the last action. The audit gives each small patch of the picture, before and after the
+step, to a decision tree that predicts the action. A patch through which an agent passes now and then tells little; a
+patch that tells half of what there is to know, by itself, is a leak. The audit looks at data, not at an encoder: it can
+be run before pretraining.
 """
 
 import warnings

@@ -117,7 +117,7 @@ def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> th.Tensor:
     space = gym.spaces.Box(0, 255, frames.shape[1:], np.uint8)
     parts = []
     # Floats of 64 x 64 pictures take 49 kB each.
-    for part in th.as_tensor(frames).split(EMBED_BATCH):
+    for part in th.split(th.as_tensor(frames), EMBED_BATCH):
         inputs = preprocess_obs(part, space)
         assert isinstance(inputs, th.Tensor)
         parts.append(encoder(inputs))

@@ -1,8 +1,8 @@
 """Nearest neighbours in embedding space: what do states that an encoder takes for alike have in common?
 
 A state's neighbour is the nearest state (L1 distance of embeddings) of any other episode, so in another layout. If the
-encoder follows the agent, neighbours have it in like places; if it follows obstacles, neighbours have like surroundings;
-if it follows the background, neighbours share their clip. Each is held against random pairs of other episodes.
+encoder follows the agent, neighbours have it in like places; if it follows obstacles, neighbours have like
+surroundings; if it follows the background, neighbours share their clip. Each is held against random pairs of states.
 """
 
 from typing import Any
@@ -68,7 +68,7 @@ def nearest_elsewhere(
         raise ValueError("neighbours are sought in other episodes, got one episode; use at least 2")
     nearest, distances = [], []
     numbers = th.as_tensor(episodes)
-    for rows in th.arange(len(features)).split(512):
+    for rows in th.split(th.arange(len(features)), 512):
         table = th.cdist(features[rows], features, p=1.0)
         table[numbers[rows][:, None] == numbers[None]] = th.inf
         least = table.min(dim=1)

@@ -138,7 +138,11 @@ def near_and_far(files: dict[str, EncoderFile], env_id: str, n_samples: int, see
         around one agent as ``example``
     """
     generator = np.random.default_rng(seed)
-    before, near, far, elsewhere, example = [], [], [], [], None
+    example = None
+    before: list[NDArray[np.uint8]] = []
+    elsewhere: list[NDArray[np.uint8]] = []
+    near: list[NDArray[np.uint8]] = []
+    far: list[NDArray[np.uint8]] = []
     for obstacles in held_out_layouts(env_id, n_samples):
         agents = reachable(obstacles)
         agent, other = generator.choice(agents, size=2, replace=False)

@@ -1,8 +1,8 @@
 """Perturbations in pixel space: point mazes drawn again from changed simulator states.
 
 One obstacle is moved by a metre and all else stays: agent, other obstacles and, in Distractor PointMaze, the frame of
-the clip behind them. For comparison the agent is moved by as much, the state is replaced by another one, and (Distractor
-PointMaze) the clip is swapped under the same state. Clips are those that no encoder was trained on.
+the clip behind them. For comparison the agent is moved by as much, the state is replaced by another one, and (in
+Distractor PointMaze) the clip is swapped under the same state. Clips are those that no encoder was trained on.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ from sb3_abisim.envs.backgrounds import load_backgrounds
 from sb3_abisim.envs.point_maze import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE, ROOM_SIZE
 from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS
 
-ENV_IDS = ("PointMaze-v0", "ContinuousPointMaze-v0", "DistractorPointMaze-v0", "ContinuousDistractorPointMaze-v0")
+ENV_IDS = ("PointMaze-v0", "DistractorPointMaze-v0", "ContinuousPointMaze-v0", "ContinuousDistractorPointMaze-v0")
 STEP = 1.0  # m, how far an obstacle or the agent is moved
 # Distances in metres from the agent's centre to the nearest edge of the obstacle, before or after the move.
 BINS = ((0.0, 0.6), (0.6, 1.2), (1.2, 2.0), (2.0, 3.0), (3.0, 5.0), (5.0, 15.0))

@@ -12,7 +12,11 @@ CMAP = "inferno"
 PIXEL_RENDER = {"agent": (214, 40, 40), "obstacles": (60, 64, 72), "floor": (240, 240, 235), "goal": (46, 160, 67)}
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Matplotlib's pyplot, without a window.
+
+    :raises ValueError: if matplotlib is not installed
+    """
     try:
         import matplotlib
     except ImportError as error:
@@ -23,15 +27,23 @@ def _pyplot() -> Any:
     return plt
 
 
-def _save(figure: Any, path: Path) -> None:
+def save(figure: Any, path: Path) -> None:
+    """Write a figure as PNG and close it.
+
+    :param figure: of matplotlib
+    :param path: the PNG; its folder is made
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     # Without the version of matplotlib, so that equal figures are equal files.
     figure.savefig(path, dpi=DPI, metadata={"Software": None})
-    _pyplot().close(figure)
+    pyplot().close(figure)
 
 
-def _array(values: Iterable[Any]) -> NDArray[np.float64]:
-    """Nested lists with None for missing numbers, as an array with NaN."""
+def as_array(values: Iterable[Any]) -> NDArray[np.float64]:
+    """Nested lists with None for missing numbers, as an array with NaN.
+
+    :param values: numbers or None
+    """
     return np.array(values, dtype=np.float64)
 
 
@@ -47,8 +59,15 @@ def _bin_names(bins: Iterable[tuple[float, float]]) -> list[str]:
     return [f"{low:g}" if low == high else f"{low:g}-{high:g}" for low, high in bins]
 
 
-def _show_map(axis: Any, values: NDArray[np.float64], title: str, reach: int, unit: str) -> Any:
-    """A map by offset around the agent, brightness relative to its largest value."""
+def show_map(axis: Any, values: NDArray[np.float64], title: str, reach: int, unit: str) -> Any:
+    """Draw a map by offset around the agent, brightness relative to its largest value.
+
+    :param axis: of matplotlib
+    :param values: [dy, dx], odd sides, the agent in the middle
+    :param title: of the panel
+    :param reach: largest offset shown
+    :param unit: of the offsets, in the plural
+    """
     size = values.shape[0] // 2
     image = axis.imshow(
         values / np.nanmax(values), cmap=CMAP, vmin=0, vmax=1, extent=(-size - 0.5, size + 0.5, size + 0.5, -size - 0.5)
@@ -59,9 +78,16 @@ def _show_map(axis: Any, values: NDArray[np.float64], title: str, reach: int, un
     return image
 
 
-def _show_profiles(axis: Any, lines: dict[str, list[float]], bins: Any, xlabel: str) -> None:
+def show_profiles(axis: Any, lines: dict[str, list[float]], bins: Any, xlabel: str) -> None:
+    """Draw sensitivity by distance on a logarithmic scale.
+
+    :param axis: of matplotlib
+    :param lines: label to a number for each bin
+    :param bins: (low, high) of each
+    :param xlabel: of the axis
+    """
     for style, (name, values) in enumerate(lines.items()):
-        axis.semilogy(_array(values), marker="osv^Dx*"[style % 7], ms=4, label=name)
+        axis.semilogy(as_array(values), marker="osv^Dx*"[style % 7], ms=4, label=name)
     names = _bin_names(bins)
     axis.set_xticks(range(len(names)), names, fontsize=8)
     axis.set(xlabel=xlabel, ylabel="change of the embedding")
@@ -75,17 +101,17 @@ def draw_maps(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.perturbation.nav2d_maps`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     encoders = results["encoders"]
     n = len(encoders)
     figure, axes = plt.subplots(1, n + 1, figsize=(3.1 * (n + 1) + 1, 3.4), constrained_layout=True)
     for axis, (name, result) in zip(axes, encoders.items(), strict=False):
-        image = _show_map(axis, _array(result["map"]), short_name(name), 7, "cells")
+        image = show_map(axis, as_array(result["map"]), short_name(name), 7, "cells")
     figure.colorbar(image, ax=list(axes[:n]), shrink=0.8, label="relative to the largest")
     lines = {short_name(name): result["profile"] for name, result in encoders.items()}
-    _show_profiles(axes[n], lines, results["bins"], "city-block distance of the toggled cell")
+    show_profiles(axes[n], lines, results["bins"], "city-block distance of the toggled cell")
     figure.suptitle(f"Change of the embedding when one cell is toggled, {results['env_id']}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_sweep(results: dict[str, Any], path: Path) -> None:
@@ -94,19 +120,19 @@ def draw_sweep(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.perturbation.sweep_maps`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     encoders = results["encoders"]
     n = len(encoders)
     figure, axes = plt.subplots(2, n + 1, figsize=(2.6 * n + 4.4, 6.0), constrained_layout=True)
     for row, (key, label) in enumerate((("", "learned"), ("exact_", "exact metric"))):
         for axis, (name, result) in zip(axes[row], encoders.items(), strict=False):
-            _show_map(axis, _array(result[f"{key}map"]), f"{label}, {name}", 7, "cells")
+            show_map(axis, as_array(result[f"{key}map"]), f"{label}, {name}", 7, "cells")
         lines = {name: result[f"{key}profile"] for name, result in encoders.items()}
-        _show_profiles(axes[row, n], lines, results["bins"], "city-block distance of the toggled cell")
+        show_profiles(axes[row, n], lines, results["bins"], "city-block distance of the toggled cell")
         axes[row, n].set_title(label, fontsize=9)
         axes[row, n].set_ylim(1e-3, 1.3)
     figure.suptitle("Action-bisimulation with several weights c of the recursive term, Nav2D-v0", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_near_and_far(results: dict[str, Any], path: Path) -> None:
@@ -115,7 +141,7 @@ def draw_near_and_far(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.perturbation.near_and_far`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     encoders = results["encoders"]
     n = len(encoders)
     figure, axes = plt.subplots(1, n + 1, figsize=(3.0 * n + 3.4, 3.4), constrained_layout=True)
@@ -128,7 +154,7 @@ def draw_near_and_far(results: dict[str, Any], path: Path) -> None:
     axes[0].set_ylabel("change of the embedding\n(1: the agent elsewhere)")
     _show_regions(axes[n], results)
     figure.suptitle(f"A new 2 x 2 obstacle near the agent or far from it, {results['env_id']}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _show_regions(axis: Any, results: dict[str, Any]) -> None:
@@ -154,7 +180,7 @@ def draw_structures(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.perturbation.structure_maps`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     encoders = results["encoders"]
     n = len(encoders)
     structure = np.array([list(row) for row in results["structure"]])
@@ -164,14 +190,14 @@ def draw_structures(results: dict[str, Any], path: Path) -> None:
     axes[0, 0].set_title("reachable (white), walls (black),\nout of reach (grey)", fontsize=9)
     axes[1, 0].axis("off")
     for k, (name, result) in enumerate(encoders.items(), start=1):
-        cells = _array(result["cells"])
+        cells = as_array(result["cells"])
         axes[0, k].imshow(cells / np.nanmax(cells), cmap=CMAP, vmin=0, vmax=1)
         axes[0, k].set_facecolor("0.6")
         outside = result["kinds"]["out of reach"]
         axes[0, k].set_title(f"{short_name(name)}\nout of reach: {outside:.2f} of reachable", fontsize=8)
-        _show_profiles(axes[1, k], result["profiles"], results["bins"], "city-block distance")
+        show_profiles(axes[1, k], result["profiles"], results["bins"], "city-block distance")
     for axis in axes[0]:
         axis.set_xticks([])
         axis.set_yticks([])
     figure.suptitle(f"Mean change of the embedding when a cell is toggled, {results['env_id']}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)

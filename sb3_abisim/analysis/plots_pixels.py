@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_abisim.analysis.plots import CMAP, _array, _pyplot, _save, _show_map, _show_profiles, short_name
+from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
 from sb3_abisim.analysis.probes import PROBES
 
 
@@ -15,28 +15,28 @@ def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.pixels.pixel_maps`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     encoders = results["encoders"]
     n = len(encoders)
     figure, axes = plt.subplots(1, n + 2, figsize=(3.0 * (n + 2) + 0.6, 3.4), constrained_layout=True)
     for axis, (name, result) in zip(axes, encoders.items(), strict=False):
-        image = _show_map(axis, _array(result["map"]), short_name(name), results["reach"], "metres")
+        image = show_map(axis, as_array(result["map"]), short_name(name), results["reach"], "metres")
     figure.colorbar(image, ax=list(axes[:n]), shrink=0.8, label="relative to the largest")
     lines = {short_name(name): result["profile"] for name, result in encoders.items()}
-    _show_profiles(axes[n], lines, results["bins"], "m from agent to obstacle")
+    show_profiles(axes[n], lines, results["bins"], "m from agent to obstacle")
     axes[n].tick_params(axis="x", rotation=30)
-    changes = {"obstacle\nwithin 0.6 m": lambda r: r["profile"][0], "agent\n1 m": lambda r: r["agent"]}
+    changes = ["obstacle\nwithin 0.6 m", "agent\n1 m"]
     if next(iter(encoders.values()))["clip"] is not None:
-        changes["clip"] = lambda r: r["clip"]
+        changes.append("clip")
     width = 0.8 / n
     for k, (name, result) in enumerate(encoders.items()):
-        heights = [value(result) for value in changes.values()]
+        heights = [result["profile"][0], result["agent"], result["clip"]][: len(changes)]
         axes[n + 1].bar(np.arange(len(changes)) + (k - (n - 1) / 2) * width, heights, width, label=short_name(name))
     axes[n + 1].set_xticks(range(len(changes)), changes, fontsize=8)
     axes[n + 1].set_ylabel("change (1: another state)")
     axes[n + 1].legend(fontsize=7)
     figure.suptitle(f"Change of the embedding when one obstacle moves by 1 m, {results['env_id']}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_neighbours(results: dict[str, Any], path: Path) -> None:
@@ -45,7 +45,7 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.neighbours.neighbours`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     pictures, encoders = results["pictures"], results["encoders"]
     n = len(pictures["query"])
     figure, axes = plt.subplots(
@@ -67,7 +67,7 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
         "neighbours; agent: distance of the agents)",
         fontsize=8,
     )
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_probes(results: dict[str, Any], path: Path) -> None:
@@ -76,7 +76,7 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.probes.probes`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     groups = results["groups"]
     settings = next(iter(groups.values()))["scores"]
     n = len(settings)
@@ -98,7 +98,7 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
     axes[0, 0].set_ylabel("score (R², AUC, accuracy)")
     axes[0, 0].legend(fontsize=7)
     figure.suptitle(f"What probes read from the embedding, {results['env_id']}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_curves(results: dict[str, Any], path: Path) -> None:
@@ -107,7 +107,7 @@ def draw_curves(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.curves.curves`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     encoders = results["encoders"]
     n = len(encoders)
     figure, axes = plt.subplots(1, n, figsize=(3.6 * n, 2.9), constrained_layout=True, squeeze=False)
@@ -123,7 +123,7 @@ def draw_curves(results: dict[str, Any], path: Path) -> None:
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)
     figure.suptitle("Pretraining", fontsize=10)
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_leak(results: dict[str, Any], path: Path) -> None:
@@ -132,15 +132,15 @@ def draw_leak(results: dict[str, Any], path: Path) -> None:
     :param results: of :func:`~sb3_abisim.analysis.leak.leak_maps`
     :param path: the PNG
     """
-    plt = _pyplot()
+    plt = pyplot()
     audits = results["audits"]
     figure, axes = plt.subplots(1, len(audits), figsize=(3.6 * len(audits), 3.4), constrained_layout=True)
     for axis, (name, one) in zip(axes, audits.items(), strict=True):
-        image = axis.imshow(_array(one["scores"]), cmap=CMAP, vmin=0, vmax=1)
+        image = axis.imshow(as_array(one["scores"]), cmap=CMAP, vmin=0, vmax=1)
         verdict = "leak" if one["leaks"] else "no leak"
         axis.set_title(f"{name}\n{verdict}, best patch {np.max(one['scores']):.2f}", fontsize=9)
         axis.set_xticks([])
         axis.set_yticks([])
     figure.colorbar(image, ax=list(axes), shrink=0.8, label="score of one patch alone")
     figure.suptitle(f"Can the action be read from few pixels? {results['env_id']}", fontsize=10)
-    _save(figure, path)
+    save(figure, path)

@@ -94,7 +94,9 @@ def make_probe(kind: str) -> Any:
 
     if kind == "linear":
         return make_pipeline(StandardScaler(), RidgeCV(ALPHAS))
-    return make_pipeline(StandardScaler(), MLPRegressor((HIDDEN,), early_stopping=True, max_iter=300, random_state=0))
+    return make_pipeline(
+        StandardScaler(), MLPRegressor(hidden_layer_sizes=(HIDDEN,), early_stopping=True, max_iter=300, random_state=0)
+    )
 
 
 def read(
@@ -132,7 +134,9 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     :return: per encoder: objective, seed, ``scores`` by setting ("held-out layouts", and "unseen clips"), target and
         probe, and ``invariance`` (:func:`invariance_ratio`; None without clips)
     """
-    settings = {"held-out layouts": {}} | ({"unseen clips": unseen_clips(env_id)} if has_clips(env_id) else {})
+    settings: dict[str, dict[str, Any]] = {"held-out layouts": {}}
+    if has_clips(env_id):
+        settings["unseen clips"] = unseen_clips(env_id)
     learn, test = (
         {name: sample_episodes(env_id, n_episodes, PER_EPISODE, 2 * seed + k, kw) for name, kw in settings.items()}
         for k in (1, 2)

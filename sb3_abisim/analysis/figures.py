@@ -1,0 +1,195 @@
+"""The table of figures: how each is computed and drawn, and how it is made from encoder names."""
+
+import json
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from sb3_abisim.analysis import curves, leak, neighbours, perturbation, pixels, plots, plots_pixels, probes, sweep
+from sb3_abisim.atomic import write_atomic
+from sb3_abisim.checkpoint import EncoderFile, load_encoder
+from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.resources import resource_path
+
+NAV2D_IDS = ("Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0")
+SHIPPED_IDS = ("Nav2D-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "DistractorPointMaze-v0")
+ALL_IDS = ("DistractorPointMaze-v0", *(key for key in ENV_IDS if key != "DistractorPointMaze-v0"))
+# Environments without shipped encoders that show the pictures of one that has some.
+SAME_PICTURES = {"Nav2DCorridor-v0": "Nav2D-v0", "Nav2DMaze-v0": "Nav2D-v0"}
+
+Compute = Callable[[dict[str, EncoderFile], str, int], dict[str, Any]]
+Draw = Callable[[dict[str, Any], Path], None]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure.
+
+    :param help: what it shows, in a line
+    :param env_ids: where it can be made, the default first
+    :param usual_ids: where ``all`` makes it
+    :param size: default of the number that ``compute`` takes last
+    :param unit: what that number counts
+    :param compute: from encoders by name, environment id and size to the numbers
+    :param draw: from the numbers to the PNG
+    :param trained: whether encoders of one's own folder join the shipped ones by default
+    :param encoders: whether it looks at encoders at all
+    """
+
+    help: str
+    env_ids: tuple[str, ...]
+    usual_ids: tuple[str, ...]
+    size: int
+    unit: str
+    compute: Compute
+    draw: Draw
+    trained: bool = False
+    encoders: bool = True
+
+
+FIGURES = {
+    "perturbation": Figure(
+        "perturbation maps on Nav2D: single-step against multi-step", NAV2D_IDS, NAV2D_IDS[:1], 16,
+        "layouts, four seconds each", perturbation.nav2d_maps, plots.draw_maps,
+    ),
+    "near-far": Figure(
+        "violins of near and far obstacles on Nav2D, with the regions", NAV2D_IDS[:1], NAV2D_IDS[:1], 1000,
+        "layouts", perturbation.near_and_far, plots.draw_near_and_far,
+    ),
+    "structures": Figure(
+        "sensitivity within and beyond the reachable part of corridor and maze", NAV2D_IDS[1:], NAV2D_IDS[1:], 16,
+        "layouts", perturbation.structure_maps, plots.draw_structures, trained=True,
+    ),
+    "pixels": Figure(
+        "perturbation maps of the point mazes: an obstacle moved, the clip swapped", pixels.ENV_IDS,
+        ("PointMaze-v0", "DistractorPointMaze-v0"), 400, "states", pixels.pixel_maps, plots_pixels.draw_pixel_maps,
+    ),
+    "neighbours": Figure(
+        "nearest neighbours in embedding space", ALL_IDS, ALL_IDS[:1], 500, "episodes", neighbours.neighbours,
+        plots_pixels.draw_neighbours,
+    ),
+    "probes": Figure(
+        "what probes read from embeddings, and the distractor-invariance ratio", ALL_IDS,
+        ("DistractorPointMaze-v0", "PointMaze-v0", "Nav2D-v0"), 500, "episodes to learn from", probes.probes,
+        plots_pixels.draw_probes, trained=True,
+    ),
+    "curves": Figure(
+        "pretraining curves, from the cards", ALL_IDS, SHIPPED_IDS, 1, "unused",
+        lambda files, env_id, size: curves.curves(files), plots_pixels.draw_curves,
+    ),
+    "leak": Figure(
+        "can the action be read from a few pixels?", ALL_IDS, ("DistractorPointMaze-v0", "Nav2D-v0"), 300, "episodes",
+        lambda files, env_id, size: leak.leak_maps(env_id, size), plots_pixels.draw_leak, encoders=False,
+    ),
+}  # fmt: skip
+
+
+def default_encoders(env_id: str, trained: Path | None = None) -> list[str]:
+    """All encoders that ship for an environment, and those of one's own folder.
+
+    :param env_id: a registered id of ours
+    :param trained: holds ``<env_id>/*.safetensors``; None for the shipped ones alone
+    :raises ValueError: if there is none
+    """
+    shipped = resource_path("encoders") / SAME_PICTURES.get(env_id, env_id)
+    names = [f"{path.parent.name}/{path.stem}" for path in sorted(shipped.glob("*.safetensors"), reverse=True)]
+    if trained is not None:
+        names += [str(path) for path in sorted((trained / env_id).glob("*.safetensors"), reverse=True)]
+    if not names:
+        raise ValueError(f"no encoder ships for {env_id}; name the files to look at")
+    return names
+
+
+def load_all(names: list[str], env_id: str) -> dict[str, EncoderFile]:
+    """Encoders by name, checked against the environment's observations.
+
+    :param names: files or names
+    :param env_id: a registered id of ours
+    :raises ValueError: for encoders of other observations
+    """
+    space = gym.make(env_id).observation_space
+    files = {name: load_encoder(name) for name in names}
+    for file in files.values():
+        file.check(space)
+    return files
+
+
+def make_figure(name: str, files: dict[str, EncoderFile], env_id: str, size: int, images: Path, numbers: Path) -> Path:
+    """Compute a figure; write its numbers and then the picture.
+
+    :param name: a key of :data:`FIGURES`
+    :param files: encoders by name
+    :param env_id: one of the figure's
+    :param size: see :class:`Figure`, at least 1
+    :param images: folder for ``<name>-<env_id>.png``
+    :param numbers: folder for ``<name>-<env_id>.json``
+    :return: the PNG
+    :raises ValueError: for a size below 1, and what the figure refuses
+    """
+    if size < 1:
+        raise ValueError(f"-n must be at least 1, got {size}")
+    # Now, not after minutes of computing.
+    plots.pyplot()
+    results = FIGURES[name].compute(files, env_id, size)
+    settings = {"figure": name, "env_id": env_id, "size": size, "size_counts": FIGURES[name].unit}
+    return write_figure(settings | results, FIGURES[name].draw, images, numbers)
+
+
+def make_sweep(
+    values: list[float], base: str, folder: Path, data: Path | None, size: int, images: Path, numbers: Path
+) -> Path:
+    """The sweep over c beside the exact metric; pretrains what is missing.
+
+    :param values: of c
+    :param base: file or name of the single-step encoder
+    :param folder: of the sweep's encoders
+    :param data: dataset of Nav2D-v0 for what is missing
+    :param size: layouts, a minute each
+    :param images: folder for the PNG
+    :param numbers: folder for the JSON
+    :return: the PNG
+    """
+    if size < 1:
+        raise ValueError(f"-n must be at least 1, got {size}")
+    plots.pyplot()
+    env_id = NAV2D_IDS[0]
+    (base_file,) = load_all([base], env_id).values()
+    files = sweep.sweep_encoders(values, base, folder, data, env_id)
+    results = perturbation.sweep_maps(files, base_file.encoder.eval(), env_id, size)
+    settings = {"figure": "sweep", "env_id": env_id, "size": size, "base": base, "base_digest": base_file.digest}
+    return write_figure(settings | results, plots.draw_sweep, images, numbers)
+
+
+def write_figure(results: dict[str, Any], draw: Draw, images: Path, numbers: Path) -> Path:
+    """Write a figure's numbers as JSON and draw it.
+
+    :param results: with ``figure`` and ``env_id``, which name the files
+    :param draw: see :class:`Figure`
+    :param images: folder for the PNG
+    :param numbers: folder for the JSON
+    """
+    stem = f"{results['figure']}-{results['env_id']}"
+    kept = {key: value for key, value in results.items() if key != "pictures"}
+    text = json.dumps(_plain(kept), indent=1, allow_nan=False)
+    # Each innermost list on one line: a map has hundreds of numbers.
+    text = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
+    numbers.mkdir(parents=True, exist_ok=True)
+    write_atomic(numbers / f"{stem}.json", lambda file: file.write(text.encode()))
+    draw(results, images / f"{stem}.png")
+    return images / f"{stem}.png"
+
+
+def _plain(value: Any) -> Any:
+    """JSON types, floats with six digits, None for what is not a number."""
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    return value
