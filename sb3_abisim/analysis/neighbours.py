@@ -12,41 +12,49 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
-from sb3_abisim.analysis.pixels import unseen_clips
+from sb3_abisim.analysis.pixels import clip_settings
 from sb3_abisim.analysis.scenes import Samples, local_obstacles, sample_episodes
 from sb3_abisim.checkpoint import EncoderFile
 
 PER_EPISODE = 10
-N_PICTURED = 6
+N_PICTURED = 4
 
 
 def neighbours(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
-    """Nearest neighbours among states of held-out layouts and, where there are clips, unseen ones.
+    """Nearest neighbours among states of held-out layouts, by setting (:func:`clip_settings`).
 
     :param files: encoders by name
     :param env_id: a registered id of ours
     :param n_episodes: :data:`PER_EPISODE` states of each make up the pool, and every one of them is a query
     :param seed: of the episodes
-    :return: per encoder and for random pairs: ``agent`` (mean distance of the two agents, in cells or metres),
-        ``obstacles`` (correlation of the surroundings, :func:`similarity`), ``same_clip`` (share; None without clips);
-        ``examples`` of a few queries; ``pictures``, not for JSON: the queries' and, by encoder, their neighbours'
+    :return: ``settings``: per encoder and for random pairs ``agent`` (mean distance of the two agents, in cells or
+        metres), ``obstacles`` (correlation of the surroundings, :func:`similarity`), ``same_clip`` (share; None without
+        clips), and ``examples`` of a few queries; ``pictures``, not for JSON: by setting, the queries' and each
+        encoder's neighbours'
     """
-    samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, unseen_clips(env_id))
-    queries = np.linspace(0, len(samples) - 1, N_PICTURED).astype(np.int64)
-    encoders, pictures = {}, {"query": samples.frames[queries]}
+    settings, pictures = {}, {}
+    for setting, env_kwargs in clip_settings(env_id).items():
+        samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, env_kwargs)
+        settings[setting], pictures[setting] = _setting(files, samples, seed)
+    digests = {name: file.digest for name, file in files.items()}
+    return {"per_episode": PER_EPISODE, "digests": digests, "settings": settings, "pictures": pictures}
+
+
+def _setting(
+    files: dict[str, EncoderFile], samples: Samples, seed: int
+) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
+    generator = np.random.default_rng(seed)
+    queries = generator.choice(len(samples), N_PICTURED, replace=False)
+    numbers: dict[str, Any] = {}
+    pictures = {"query": samples.frames[queries]}
     for name, file in files.items():
         nearest, distances = nearest_elsewhere(embed(file.encoder.eval(), samples.frames), samples.episodes)
         examples = _pair_numbers(samples, queries, nearest[queries])
-        encoders[name] = {
-            "digest": file.digest,
-            **similarity(samples, nearest),
-            "examples": {**examples, "distance": _relative(distances)[queries].tolist()},
-        }
+        examples["distance"] = _relative(distances)[queries].tolist()
+        numbers[name] = {**similarity(samples, nearest), "examples": examples}
         pictures[name] = samples.frames[nearest[queries]]
-    generator = np.random.default_rng(seed)
-    random = [similarity(samples, _random_elsewhere(samples.episodes, generator)) for _ in range(5)]
-    means = {key: None if random[0][key] is None else float(np.mean([one[key] for one in random])) for key in random[0]}
-    return {"n_states": len(samples), "encoders": encoders, "random pairs": means, "pictures": pictures}
+    numbers["random pairs"] = similarity(samples, _random_elsewhere(samples.episodes, generator))
+    return numbers, pictures
 
 
 def _relative(distances: NDArray[np.float32]) -> NDArray[np.float64]:

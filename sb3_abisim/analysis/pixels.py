@@ -2,7 +2,8 @@
 
 One obstacle is moved by a metre and all else stays: agent, other obstacles and, in Distractor PointMaze, the frame of
 the clip behind them. For comparison the agent is moved by as much, the state is replaced by another one, and (in
-Distractor PointMaze) the clip is swapped under the same state. Clips are those that no encoder was trained on.
+Distractor PointMaze) the clip is swapped under the same state. Clips are those of pretraining and, apart from them,
+unseen ones.
 """
 
 from typing import Any
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from sb3_abisim.analysis.nav2d_exact import embed
 from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, sample_episodes
 from sb3_abisim.checkpoint import EncoderFile
-from sb3_abisim.envs.backgrounds import load_backgrounds
+from sb3_abisim.envs.backgrounds import SPLITS, Backgrounds, load_backgrounds
 from sb3_abisim.envs.point_maze import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE, ROOM_SIZE
 from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS
+from sb3_abisim.networks import Encoder
 
 ENV_IDS = ("PointMaze-v0", "DistractorPointMaze-v0", "ContinuousPointMaze-v0", "ContinuousDistractorPointMaze-v0")
 STEP = 1.0  # m, how far an obstacle or the agent is moved
@@ -36,32 +38,45 @@ def has_clips(env_id: str) -> bool:
     return "Distractor" in env_id
 
 
-def unseen_clips(env_id: str) -> dict[str, Any]:
-    """Keyword arguments with which an environment shows clips that pretraining has not seen.
+def clip_settings(env_id: str) -> dict[str, dict[str, Any]]:
+    """What encoders are looked at on: name to the environment's keyword arguments. Layouts are always held out.
 
-    :param env_id: a registered id of ours
-    """
-    return {"split": "eval"} if has_clips(env_id) else {}
-
-
-def backgrounds_of(samples: Samples, env_id: str) -> NDArray[np.uint8] | None:
-    """The clip frames behind samples of unseen clips, uint8 (n, 3, 64, 64); None where there are none.
-
-    :param samples: with the environment arguments of :func:`unseen_clips`
     :param env_id: a registered id of ours
     """
     if not has_clips(env_id):
+        return {"held-out layouts": {}}
+    return {"clips of pretraining": {"split": "train"}, "unseen clips": {"split": "eval"}}
+
+
+def clips_of(samples: Samples) -> Backgrounds | None:
+    """The built-in clips that samples were drawn from; None for environments without.
+
+    :param samples: with factors
+    """
+    if "clip_id" not in samples.factors:
         return None
-    return load_backgrounds(None, "eval").frames(samples.factors["clip"], samples.factors["frame"])
+    sides = (load_backgrounds(None, split) for split in SPLITS)
+    (clips,) = (side for side in sides if np.isin(samples.factors["clip_id"], side.clip_ids).all())
+    return clips
+
+
+def backgrounds_of(samples: Samples) -> NDArray[np.uint8] | None:
+    """The clip frames behind samples, uint8 (n, 3, 64, 64); None for environments without clips.
+
+    :param samples: with factors
+    """
+    clips = clips_of(samples)
+    return None if clips is None else clips.frames(samples.factors["clip"], samples.factors["frame"])
 
 
 def swapped_backgrounds(samples: Samples, generator: np.random.Generator) -> NDArray[np.uint8]:
-    """Frames of another unseen clip for each sample, uint8 (n, 3, 64, 64).
+    """Frames of another clip of the same side for each sample, uint8 (n, 3, 64, 64).
 
     :param samples: of an environment with clips
     :param generator: draws clip and frame
     """
-    clips = load_backgrounds(None, "eval")
+    clips = clips_of(samples)
+    assert clips is not None
     clip = (samples.factors["clip"] + generator.integers(1, clips.n_clips, size=len(samples))) % clips.n_clips
     return clips.frames(clip, generator.integers(0, clips.lengths[clip]))
 
@@ -73,41 +88,56 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
     :param env_id: one of the point mazes
     :param n_states: agents, each in a layout of its own
     :param seed: of the choices
-    :return: per encoder, in units of the mean distance between two states on the same background: ``map`` by offset
-        [dy, dx] in metres from agent to obstacle, ``profile`` by distance (:data:`BINS`), ``agent``, and ``clip``
-        (None without clips)
+    :return: per encoder and setting (:func:`clip_settings`), in units of the mean distance between two states on the
+        same background: ``map`` by offset [dy, dx] in metres from agent to obstacle, ``profile`` by distance
+        (:data:`BINS`), ``agent``, and ``clip`` (None without clips)
     :raises ValueError: for an environment without pixels of this kind
     """
     if env_id not in ENV_IDS:
         raise ValueError(f"obstacles can be moved in {', '.join(ENV_IDS)}, got {env_id!r}")
-    samples = sample_episodes(env_id, n_states, 1, seed, unseen_clips(env_id))
-    generator = np.random.default_rng(seed)
+    encoders: dict[str, Any] = {name: {"digest": file.digest, "settings": {}} for name, file in files.items()}
+    for setting, env_kwargs in clip_settings(env_id).items():
+        samples = sample_episodes(env_id, n_states, 1, seed, env_kwargs)
+        scenes = _scenes(samples, np.random.default_rng(seed))
+        for name, file in files.items():
+            encoders[name]["settings"][setting] = _changes(file.encoder.eval(), scenes)
+    return {"bins": BINS, "reach": MAP_REACH, "encoders": encoders}
+
+
+def _scenes(samples: Samples, generator: np.random.Generator) -> dict[str, Any]:
+    """Pictures of the samples and of what was changed in them."""
     agents, obstacles = samples.factors["agent"].astype(np.float64), samples.factors["obstacles"].astype(np.float64)
-    behind = backgrounds_of(samples, env_id)
-    here = draw_point_mazes(agents, obstacles, behind)
+    behind = backgrounds_of(samples)
     moves = _moves(agents, obstacles, generator)
-    index, gap = moves["state"], moves["gap"]
-    moved = draw_point_mazes(agents[index], moves["obstacles"], None if behind is None else behind[index])
-    others = generator.permutation(len(samples))
-    others = np.where(others == np.arange(len(samples)), (others + 1) % len(samples), others)
-    different = draw_point_mazes(agents[others], obstacles[others], behind)
+    index = moves["state"]
+    others = np.roll(np.arange(len(samples)), 1)
     nudged, who = _nudged(agents, obstacles, behind, generator)
-    encoders = {}
-    for name, file in files.items():
-        features = embed(file.encoder.eval(), here)
-        unit = float(_l1(features, embed(file.encoder, different)).mean())
-        change = (_l1(features[th.as_tensor(index)], embed(file.encoder, moved)) / unit).numpy()
-        encoders[name] = {
-            "digest": file.digest,
-            "map": _offset_map(moves["offset"], change).tolist(),
-            "profile": [float(change[(low <= gap) & (gap < high)].mean()) for low, high in BINS],
-            "agent": float(_l1(features[th.as_tensor(who)], embed(file.encoder, nudged)).mean()) / unit,
-            "clip": None,
-        }
-        if behind is not None:
-            swapped = draw_point_mazes(agents, obstacles, swapped_backgrounds(samples, np.random.default_rng(seed)))
-            encoders[name]["clip"] = float(_l1(features, embed(file.encoder, swapped)).mean()) / unit
-    return {"bins": BINS, "n_moves": len(index), "reach": MAP_REACH, "encoders": encoders}
+    swapped = None if behind is None else draw_point_mazes(agents, obstacles, swapped_backgrounds(samples, generator))
+    return {
+        "here": draw_point_mazes(agents, obstacles, behind),
+        "others": draw_point_mazes(agents[others], obstacles[others], behind),
+        "moved": draw_point_mazes(agents[index], moves["obstacles"], None if behind is None else behind[index]),
+        "nudged": nudged,
+        "swapped": swapped,
+        "moves": moves,
+        "who": who,
+    }
+
+
+def _changes(encoder: Encoder, scenes: dict[str, Any]) -> dict[str, Any]:
+    """The numbers of one encoder in one setting."""
+    here, others, moved, nudged = (embed(encoder, scenes[key]) for key in ("here", "others", "moved", "nudged"))
+    moves = scenes["moves"]
+    unit = float(_l1(here, others).mean())
+    change = (_l1(here[th.as_tensor(moves["state"])], moved) / unit).numpy()
+    within = [(low <= moves["gap"]) & (moves["gap"] < high) for low, high in BINS]
+    swapped = scenes["swapped"]
+    return {
+        "map": _offset_map(moves["offset"], change).tolist(),
+        "profile": [float(change[chosen].mean()) if chosen.any() else None for chosen in within],
+        "agent": float(_l1(here[th.as_tensor(scenes["who"])], nudged).mean()) / unit,
+        "clip": None if swapped is None else float(_l1(here, embed(encoder, swapped)).mean()) / unit,
+    }
 
 
 def _l1(x: th.Tensor, y: th.Tensor) -> th.Tensor:

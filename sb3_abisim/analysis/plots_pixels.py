@@ -8,6 +8,8 @@ import numpy as np
 from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
 from sb3_abisim.analysis.probes import PROBES
 
+N_COLOURS = 96
+
 
 def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
     """Maps of a moved obstacle, profiles by distance, and what other changes do.
@@ -17,57 +19,82 @@ def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
     """
     plt = pyplot()
     encoders = results["encoders"]
+    settings = list(next(iter(encoders.values()))["settings"])
     n = len(encoders)
-    figure, axes = plt.subplots(1, n + 2, figsize=(3.0 * (n + 2) + 0.6, 3.4), constrained_layout=True)
-    for axis, (name, result) in zip(axes, encoders.items(), strict=False):
-        image = show_map(axis, as_array(result["map"]), short_name(name), results["reach"], "metres")
-    figure.colorbar(image, ax=list(axes[:n]), shrink=0.8, label="relative to the largest")
-    lines = {short_name(name): result["profile"] for name, result in encoders.items()}
-    show_profiles(axes[n], lines, results["bins"], "m from agent to obstacle")
-    axes[n].tick_params(axis="x", rotation=30)
-    changes = ["obstacle\nwithin 0.6 m", "agent\n1 m"]
-    if next(iter(encoders.values()))["clip"] is not None:
-        changes.append("clip")
-    width = 0.8 / n
-    for k, (name, result) in enumerate(encoders.items()):
-        heights = [result["profile"][0], result["agent"], result["clip"]][: len(changes)]
-        axes[n + 1].bar(np.arange(len(changes)) + (k - (n - 1) / 2) * width, heights, width, label=short_name(name))
-    axes[n + 1].set_xticks(range(len(changes)), changes, fontsize=8)
-    axes[n + 1].set_ylabel("change (1: another state)")
-    axes[n + 1].legend(fontsize=7)
+    figure, axes = plt.subplots(
+        len(settings), n + 2, figsize=(3.0 * (n + 2) + 0.6, 3.1 * len(settings) + 0.3), constrained_layout=True,
+        squeeze=False,
+    )  # fmt: skip
+    for row, setting in zip(axes, settings, strict=True):
+        here = {name: result["settings"][setting] for name, result in encoders.items()}
+        for axis, (name, result) in zip(row, here.items(), strict=False):
+            image = show_map(axis, as_array(result["map"]), short_name(name), results["reach"], "metres")
+        row[0].set_ylabel(setting)
+        figure.colorbar(image, ax=list(row[:n]), shrink=0.8, label="relative to the largest")
+        lines = {short_name(name): result["profile"] for name, result in here.items()}
+        show_profiles(row[n], lines, results["bins"], "m from agent to obstacle")
+        row[n].tick_params(axis="x", rotation=30)
+        _show_changes(row[n + 1], here)
     figure.suptitle(f"Change of the embedding when one obstacle moves by 1 m, {results['env_id']}", fontsize=10)
     save(figure, path)
 
 
+def _show_changes(axis: Any, here: dict[str, Any]) -> None:
+    """Bars of what an obstacle beside the agent, the agent and the clip change."""
+    changes = ["obstacle\nwithin 0.6 m", "agent\n1 m"]
+    if next(iter(here.values()))["clip"] is not None:
+        changes.append("clip")
+    width = 0.8 / len(here)
+    for k, (name, result) in enumerate(here.items()):
+        heights = as_array([result["profile"][0], result["agent"], result["clip"]][: len(changes)])
+        axis.bar(np.arange(len(changes)) + (k - (len(here) - 1) / 2) * width, heights, width, label=short_name(name))
+    axis.axhline(1.0, color="0.5", lw=0.8, ls="--")
+    axis.set_xticks(range(len(changes)), changes, fontsize=8)
+    axis.set_ylabel("change (1: another state)")
+    axis.legend(fontsize=7)
+
+
 def draw_neighbours(results: dict[str, Any], path: Path) -> None:
-    """Queries in the first row, each encoder's nearest neighbours below with their distances.
+    """Queries in the first row, each encoder's nearest neighbours below with their distances; settings side by side.
 
     :param results: of :func:`~sb3_abisim.analysis.neighbours.neighbours`
     :param path: the PNG
     """
     plt = pyplot()
-    pictures, encoders = results["pictures"], results["encoders"]
-    n = len(pictures["query"])
+    pictures = results["pictures"]
+    rows = list(next(iter(pictures.values())))
+    columns = [(setting, k) for setting, frames in pictures.items() for k in range(len(frames["query"]))]
     figure, axes = plt.subplots(
-        len(pictures), n, figsize=(1.5 * n + 0.6, 1.9 * len(pictures) + 0.5), constrained_layout=True, squeeze=False
+        len(rows), len(columns), figsize=(1.2 * len(columns) + 0.4, 1.5 * len(rows) + 0.5), constrained_layout=True
     )
-    for row, (name, frames) in zip(axes, pictures.items(), strict=True):
-        for k, (axis, frame) in enumerate(zip(row, frames, strict=True)):
-            axis.imshow(frame.transpose(1, 2, 0))
+    for row, name in zip(axes, rows, strict=True):
+        for axis, (setting, k) in zip(row, columns, strict=True):
+            axis.imshow(pictures[setting][name][k].transpose(1, 2, 0))
             axis.set_xticks([])
             axis.set_yticks([])
-            if name in encoders:
-                example = encoders[name]["examples"]
-                same = "" if example["same_clip"] is None else (", same clip" if example["same_clip"][k] else "")
-                words = f"d {example['distance'][k]:.2f}, agent {example['agent'][k]:.1f}{same}"
-                axis.set_title(words, fontsize=7)
-        row[0].set_ylabel(short_name(name), fontsize=8)
+            if name == "query":
+                axis.set_title(setting, fontsize=7)
+                continue
+            example = results["settings"][setting][name]["examples"]
+            clip = "" if not example["same_clip"] else ("same clip" if example["same_clip"][k] else "other clip")
+            axis.set_title(f"d {example['distance'][k]:.2f}, {example['agent'][k]:.1f} m\n{clip}", fontsize=6)
+        row[0].set_ylabel(short_name(name), fontsize=7)
     figure.suptitle(
-        f"Nearest states of other episodes, {results['env_id']} (d: distance of embeddings, 1 is the mean of all "
-        "neighbours; agent: distance of the agents)",
+        f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings, 1 is the mean of all "
+        "neighbours; m: distance of the agents)",
         fontsize=8,
     )
     save(figure, path)
+    _reduce_colours(path)
+
+
+def _reduce_colours(path: Path) -> None:
+    """Photographs make large PNGs; a palette is a third of that."""
+    from PIL import Image
+
+    with Image.open(path) as picture:
+        small = picture.convert("RGB").quantize(N_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    small.save(path, optimize=True)
 
 
 def draw_probes(results: dict[str, Any], path: Path) -> None:

@@ -16,10 +16,9 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
-from sb3_abisim.analysis.pixels import backgrounds_of, has_clips, swapped_backgrounds, unseen_clips
+from sb3_abisim.analysis.pixels import backgrounds_of, clip_settings, clips_of, swapped_backgrounds
 from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, local_obstacles, sample_episodes
 from sb3_abisim.checkpoint import EncoderFile
-from sb3_abisim.envs.backgrounds import SPLITS, Backgrounds, load_backgrounds
 from sb3_abisim.networks import Encoder, make_encoder
 
 PER_EPISODE = 10
@@ -70,16 +69,12 @@ def targets(samples: Samples) -> dict[str, Target]:
     }
     if "goal" in factors and factors["goal"].std(axis=0).max() > 0:
         found["goal"] = Target(factors["goal"].astype(np.float64), "continuous")
-    if "clip" in factors and factors["clip"].max() >= 0:
+    clips = clips_of(samples)
+    if clips is not None:
         # All clips of the side, in its order, so that classes are the same in every sample.
-        (clips,) = (side for side in map(_clips, SPLITS) if np.isin(factors["clip_id"], side.clip_ids).all())
         found["clip"] = Target((factors["clip_id"][:, None] == clips.clip_ids).astype(np.float64), "classes")
         found["phase"] = Target((factors["frame"] / (clips.lengths[factors["clip"]] - 1))[:, None], "continuous")
     return found
-
-
-def _clips(split: str) -> Backgrounds:
-    return load_backgrounds(None, split)
 
 
 def make_probe(kind: str) -> Any:
@@ -131,12 +126,11 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     :param env_id: a registered id of ours
     :param n_episodes: to learn from, and as many again for each test
     :param seed: of the episodes and the untrained weights
-    :return: per encoder: objective, seed, ``scores`` by setting ("held-out layouts", and "unseen clips"), target and
-        probe, and ``invariance`` (:func:`invariance_ratio`; None without clips)
+    :return: per encoder: objective, seed, ``scores`` by setting
+        (:func:`~sb3_abisim.analysis.pixels.clip_settings`), target and probe, and ``invariance`` by setting
+        (:func:`invariance_ratio`; None without clips)
     """
-    settings: dict[str, dict[str, Any]] = {"held-out layouts": {}}
-    if has_clips(env_id):
-        settings["unseen clips"] = unseen_clips(env_id)
+    settings = clip_settings(env_id)
     learn, test = (
         {name: sample_episodes(env_id, n_episodes, PER_EPISODE, 2 * seed + k, kw) for name, kw in settings.items()}
         for k in (1, 2)
@@ -151,8 +145,8 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     results = {}
     for name, (encoder, origin) in encoders.items():
         scores = {setting: _scores(encoder, learn, test, setting) for setting in settings}
-        ratio = invariance_ratio(encoder, test["unseen clips"], env_id) if has_clips(env_id) else None
-        results[name] = {**origin, "scores": scores, "invariance": ratio}
+        ratios = {setting: invariance_ratio(encoder, test[setting]) for setting in settings}
+        results[name] = {**origin, "scores": scores, "invariance": ratios}
     return {"n_frames": len(pictures), "encoders": results, "groups": by_objective(results)}
 
 
@@ -183,19 +177,21 @@ def _scores(encoder: Encoder, learn: dict[str, Samples], test: dict[str, Samples
     return scores
 
 
-def invariance_ratio(encoder: Encoder, samples: Samples, env_id: str, seed: int = 0) -> float:
+def invariance_ratio(encoder: Encoder, samples: Samples, seed: int = 0) -> float | None:
     """Distance between the same state on two clips, over the distance between different states on the same clip.
 
     0 is an encoder that does not see the background, 1 one for which a new clip is as much as a new state.
 
     :param encoder: in evaluation mode
-    :param samples: with the environment arguments of :func:`~sb3_abisim.analysis.pixels.unseen_clips`
-    :param env_id: an environment with clips
+    :param samples: :data:`PER_EPISODE` of each episode, with factors
     :param seed: of the choices
+    :return: None for environments without clips
     """
+    behind = backgrounds_of(samples)
+    if behind is None:
+        return None
     generator = np.random.default_rng(seed)
     agents, obstacles = samples.factors["agent"], samples.factors["obstacles"]
-    behind = backgrounds_of(samples, env_id)
     others = np.roll(np.arange(len(samples)), PER_EPISODE)
     here = embed(encoder, draw_point_mazes(agents, obstacles, behind))
     elsewhere = embed(encoder, draw_point_mazes(agents[others], obstacles[others], behind))
@@ -232,8 +228,11 @@ def by_objective(results: dict[str, Any]) -> dict[str, Any]:
             }
             for setting in members[0]["scores"]
         }
-        ratio = mean_interval([member["invariance"] for member in members])
-        summary[objective] = {"n_seeds": len(members), "scores": scores, "invariance": ratio}
+        ratios = {
+            setting: mean_interval([member["invariance"][setting] for member in members])
+            for setting in members[0]["invariance"]
+        }
+        summary[objective] = {"n_seeds": len(members), "scores": scores, "invariance": ratios}
     return summary
 
 
@@ -260,15 +259,15 @@ def table(results: dict[str, Any]) -> str:
     """
     first = next(iter(results["groups"].values()))
     columns = [(setting, target) for setting, scores in first["scores"].items() for target in scores]
-    clips = first["invariance"] is not None
+    ratios = [setting for setting, ratio in first["invariance"].items() if ratio is not None]
     header = ["encoder", "seeds", *(f"{target}, {setting}" for setting, target in columns)]
-    header += ["invariance ratio"] if clips else []
+    header += [f"invariance ratio, {setting}" for setting in ratios]
     rows = [header, ["---", *["---:"] * (len(header) - 1)]]
     for objective, group in results["groups"].items():
         cells = [group["scores"][setting][target] for setting, target in columns]
         words = [" / ".join(_number(cell[kind]) for kind in PROBES) for cell in cells]
         row = [objective, str(group["n_seeds"]), *words]
-        rows.append(row + ([_number(group["invariance"])] if clips else []))
+        rows.append(row + [_number(group["invariance"][setting]) for setting in ratios])
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
