@@ -67,7 +67,7 @@ FIGURES = {
     ),
     "pixels": Figure(
         "perturbation maps of the point mazes: an obstacle moved, the clip swapped", pixels.ENV_IDS,
-        ("PointMaze-v0", "DistractorPointMaze-v0"), 400, "states", pixels.pixel_maps, plots_pixels.draw_pixel_maps,
+        ("PointMaze-v0", "DistractorPointMaze-v0"), 1500, "states", pixels.pixel_maps, plots_pixels.draw_pixel_maps,
     ),
     "neighbours": Figure(
         "nearest neighbours in embedding space", ALL_IDS, ALL_IDS[:1], 500, "episodes", neighbours.neighbours,

@@ -8,7 +8,7 @@ import numpy as np
 from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
 from sb3_abisim.analysis.probes import PROBES
 
-N_COLOURS = 96
+N_COLOURS = 256
 
 
 def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
@@ -78,7 +78,7 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
             example = results["settings"][setting][name]["examples"]
             clip = "" if not example["same_clip"] else ("same clip" if example["same_clip"][k] else "other clip")
             axis.set_title(f"d {example['distance'][k]:.2f}, {example['agent'][k]:.1f} m\n{clip}", fontsize=6)
-        row[0].set_ylabel(short_name(name), fontsize=7)
+        row[0].set_ylabel(name.rsplit("/", 1)[-1].removesuffix(".safetensors"), fontsize=7)
     figure.suptitle(
         f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings, 1 is the mean of all "
         "neighbours; m: distance of the agents)",

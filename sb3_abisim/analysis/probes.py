@@ -130,6 +130,8 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
         (:func:`~sb3_abisim.analysis.pixels.clip_settings`), target and probe, and ``invariance`` by setting
         (:func:`invariance_ratio`; None without clips)
     """
+    # Before minutes of computing.
+    _refuse_twins([_origin(file) for file in files.values()])
     settings = clip_settings(env_id)
     learn, test = (
         {name: sample_episodes(env_id, n_episodes, PER_EPISODE, 2 * seed + k, kw) for name, kw in settings.items()}
@@ -207,17 +209,12 @@ def by_objective(results: dict[str, Any]) -> dict[str, Any]:
         None for one seed), and ``invariance`` likewise
     :raises ValueError: if two encoders have the same objective and seed: they differ in something else
     """
+    _refuse_twins(list(results.values()))
     groups: dict[str, list[dict[str, Any]]] = {}
     for result in results.values():
         groups.setdefault(result["objective"], []).append(result)
     summary = {}
     for objective, members in groups.items():
-        seeds = [member["seed"] for member in members]
-        if len(set(seeds)) < len(seeds):
-            raise ValueError(
-                f"two {objective} encoders with the same seed (seeds {seeds}): intervals are over pretraining seeds, "
-                "so give encoders that differ in nothing else"
-            )
         scores = {
             setting: {
                 target: {
@@ -234,6 +231,16 @@ def by_objective(results: dict[str, Any]) -> dict[str, Any]:
         }
         summary[objective] = {"n_seeds": len(members), "scores": scores, "invariance": ratios}
     return summary
+
+
+def _refuse_twins(origins: list[dict[str, Any]]) -> None:
+    pairs = [(origin["objective"], origin["seed"]) for origin in origins]
+    twins = sorted({pair for pair in pairs if pairs.count(pair) > 1})
+    if twins:
+        raise ValueError(
+            f"encoders of the same objective and the same seed: {twins}; intervals are over pretraining seeds, so give "
+            "encoders that differ in nothing else"
+        )
 
 
 def mean_interval(values: list[float | None]) -> tuple[float, float | None] | None:

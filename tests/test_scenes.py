@@ -1,0 +1,100 @@
+"""Samples are what the environments show, and pictures drawn from factors are the environments' own."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_abisim.analysis.pixels import backgrounds_of, clips_of, swapped_backgrounds
+from sb3_abisim.analysis.scenes import draw_point_mazes, local_obstacles, sample_episodes
+from sb3_abisim.envs import top_down
+from sb3_abisim.envs.nav2d import MOVES, SIZE
+from sb3_abisim.envs.point_maze import to_pixels
+
+
+@pytest.fixture(scope="module")
+def nav2d():
+    return sample_episodes("Nav2D-v0", 60, 4, seed=1)
+
+
+@pytest.fixture(scope="module")
+def distractor():
+    return sample_episodes("DistractorPointMaze-v0", 12, 3, seed=1, env_kwargs={"split": "eval"})
+
+
+def test_samples_are_transitions_of_different_layouts(nav2d):
+    assert set(nav2d.episodes) == set(range(60))
+    layouts = {nav2d.factors["obstacles"][nav2d.episodes == k][0].tobytes() for k in range(60)}
+    assert len(layouts) == 60
+    for frame, action, after, agent in zip(
+        nav2d.frames, nav2d.actions, nav2d.next_frames, nav2d.factors["agent"], strict=True
+    ):
+        np.testing.assert_array_equal(np.argwhere(frame[0])[0][::-1], agent)
+        x, y = agent + np.array(MOVES[action])
+        stays = not (0 <= x < SIZE and 0 <= y < SIZE) or frame[1, y, x]
+        assert after[0, agent[1] if stays else y, agent[0] if stays else x] == 255
+        np.testing.assert_array_equal(frame[1], after[1])
+
+
+def test_seeds_give_other_samples_and_the_same_again(nav2d):
+    np.testing.assert_array_equal(sample_episodes("Nav2D-v0", 60, 4, seed=1).frames, nav2d.frames)
+    other = sample_episodes("Nav2D-v0", 60, 4, seed=2)
+    assert not {a.tobytes() for a in other.frames[:, 1]} & {a.tobytes() for a in nav2d.frames[:, 1]}
+
+
+def test_no_episodes_is_an_error():
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        sample_episodes("Nav2D-v0", 0, 1)
+
+
+def test_surroundings_in_nav2d(nav2d):
+    blocked = local_obstacles(nav2d.factors)
+    for frame, (x, y), row in zip(nav2d.frames, nav2d.factors["agent"], blocked, strict=True):
+        expected = []
+        for dy in (-2, -1, 0, 1, 2):
+            for dx in (-2, -1, 0, 1, 2):
+                if (dx, dy) != (0, 0):
+                    inside = 0 <= x + dx < SIZE and 0 <= y + dy < SIZE
+                    expected.append(not inside or frame[1, y + dy, x + dx] == 255)
+        np.testing.assert_array_equal(row, expected)
+
+
+def test_surroundings_in_the_point_mazes_are_what_is_seen():
+    samples = sample_episodes("PointMaze-v0", 10, 3)
+    blocked = local_obstacles(samples.factors)
+    solid = [np.array(colour)[:, None, None] for colour in (top_down.WALL, top_down.OBSTACLE)]
+    offsets = [(dx, dy) for dy in (-2, -1, 0, 1, 2) for dx in (-2, -1, 0, 1, 2) if (dx, dy) != (0, 0)]
+    n_checked = 0
+    for frame, agent, row in zip(samples.frames, samples.factors["agent"], blocked, strict=True):
+        seen = np.any([(frame == colour).all(axis=0) for colour in solid], axis=0)
+        for offset, value in zip(offsets, row, strict=True):
+            column, line = np.floor(to_pixels(agent + np.array(offset))).astype(int)
+            if 0 <= column < 64 and 0 <= line < 64:
+                assert seen[line, column] == value
+                n_checked += 1
+    assert n_checked > 400 and 0.1 < blocked.mean() < 0.9
+
+
+@pytest.mark.parametrize("env_id", ["PointMaze-v0", "ContinuousPointMaze-v0"])
+def test_drawn_mazes_are_those_of_the_environment(env_id):
+    samples = sample_episodes(env_id, 8, 3)
+    drawn = draw_point_mazes(samples.factors["agent"], samples.factors["obstacles"])
+    # Factors are float32.
+    assert np.abs(drawn.astype(int) - samples.frames).max() <= 2
+    assert (drawn == samples.frames).mean() > 0.999
+
+
+def test_drawn_mazes_over_clips(distractor):
+    drawn = draw_point_mazes(distractor.factors["agent"], distractor.factors["obstacles"], backgrounds_of(distractor))
+    assert np.abs(drawn.astype(int) - distractor.frames).max() <= 2
+    env = gym.make("DistractorPointMaze-v0", split="clean")
+    assert clips_of(distractor).split == "eval"
+    assert clips_of(sample_episodes("PointMaze-v0", 1, 1)) is None
+    assert env.observation_space.shape == drawn.shape[1:]
+
+
+def test_swapped_backgrounds_are_of_other_clips(distractor):
+    swapped = swapped_backgrounds(distractor, np.random.default_rng(0))
+    clips = clips_of(distractor)
+    for picture, own in zip(swapped, distractor.factors["clip"], strict=True):
+        sources = {k for k in range(clips.n_clips) if (clips._load(k) == picture).all(axis=(1, 2, 3)).any()}
+        assert sources and own not in sources
