@@ -11,20 +11,21 @@ from sb3_abisim.networks import Encoder
 
 
 class Masked(nn.Module):
-    """The pixels that a mask keeps, as they are (0..1)."""
+    """The pixels that a mask keeps, as they are (0..1), and no others."""
 
     def __init__(self, mask):
         super().__init__()
-        self.mask = th.as_tensor(mask, dtype=th.float32)
+        self.kept = th.as_tensor(mask).flatten().nonzero()[:, 0]
 
     def forward(self, observations):
         # The encoder has mapped 0..1 to -1..1.
-        return ((observations + 1) / 2 * self.mask).flatten(1)
+        return ((observations + 1) / 2).flatten(1)[:, self.kept]
 
 
 def file_of(layers, shape, objective="ssi", seed=0):
     """An encoder file that was never on a disk."""
-    encoder = Encoder(layers, int(np.prod(shape)), {})
+    n_features = len(layers.kept) if isinstance(layers, Masked) else int(np.prod(shape[1:]))
+    encoder = Encoder(layers, n_features, {})
     contract = {"objective": objective, "settings": {"seed": seed}, "env_id": "?"}
     return EncoderFile(Path("nowhere"), "0" * 64, encoder, contract)
 

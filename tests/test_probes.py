@@ -83,12 +83,13 @@ def test_table_over_seeds(monkeypatch):
     monkeypatch.setattr(module, "PROBES", ("linear",))
     mask = np.zeros((3, 15, 15))
     mask[0] = 1
-    files = {f"seed {seed}": file_of(Masked(mask * (1 + seed)), mask.shape, "ssi", seed) for seed in (0, 1)}
-    results = probes(files, "Nav2D-v0", 150)
+    files = {f"seed {seed}": file_of(Masked(mask), mask.shape, "ssi", seed) for seed in (0, 1)}
+    files["seed 1"].encoder.scale *= 3
+    results = probes(files, "Nav2D-v0", 60)
     group = results["groups"]["ssi"]
     mean, half = group["scores"]["held-out layouts"]["agent"]["linear"]
     # Position is linear in the agent's channel, and both encoders hold the same of it.
-    assert group["n_seeds"] == 2 and mean > 0.95 and half == pytest.approx(0, abs=1e-4)
+    assert group["n_seeds"] == 2 and mean > 0.7 and half == pytest.approx(0, abs=1e-4)
     assert group["scores"]["held-out layouts"]["obstacles"]["linear"][0] < 0.75
     assert "| ssi | 2 |" in table(results) and "untrained" in table(results) and "invariance" not in table(results)
 

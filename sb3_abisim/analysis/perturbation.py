@@ -104,8 +104,10 @@ def structure_maps(files: dict[str, EncoderFile], env_id: str, n_layouts: int) -
         profiles = {label: _kind_profile(maps, structure == kind) for kind, label in KINDS.items()}
         nearest = profiles[KINDS["."]][0]
         seen = ~np.isnan(maps)
-        means = np.where(seen, maps, 0).sum(axis=(0, 1)) / np.maximum(seen.sum(axis=(0, 1)), 1)
-        means[GOAL_CELL] = np.nan
+        counts = seen.sum(axis=(0, 1))
+        sums = np.where(seen, maps, 0).sum(axis=(0, 1))
+        # The goal is never toggled.
+        means = np.divide(sums, counts, out=np.full(N_CELLS, np.nan), where=counts > 0)
         reference = np.nanmean(means[structure == "."])
         encoders[name] = {
             "digest": file.digest,

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
-from sb3_abisim.analysis.probes import PROBES
 
 N_COLOURS = 256
 
@@ -106,16 +105,18 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
     plt = pyplot()
     groups = results["groups"]
     settings = next(iter(groups.values()))["scores"]
+    # Of every target: what probes there are.
+    kinds = list(next(iter(next(iter(settings.values())).values())))
     n = len(settings)
     figure, axes = plt.subplots(1, n, figsize=(5.6 * n, 3.4), constrained_layout=True, squeeze=False)
-    width = 0.8 / (len(groups) * len(PROBES))
+    width = 0.8 / (len(groups) * len(kinds))
     for axis, (setting, names) in zip(axes[0], settings.items(), strict=True):
         for k, (objective, group) in enumerate(groups.items()):
-            for j, kind in enumerate(PROBES):
+            for j, kind in enumerate(kinds):
                 cells = [group["scores"][setting][target][kind] for target in names]
                 heights = [np.nan if cell is None else max(cell[0], -0.2) for cell in cells]
                 errors = [0.0 if cell is None or cell[1] is None else cell[1] for cell in cells]
-                place = np.arange(len(names)) + (k * len(PROBES) + j - (len(groups) * len(PROBES) - 1) / 2) * width
+                place = np.arange(len(names)) + (k * len(kinds) + j - (len(groups) * len(kinds) - 1) / 2) * width
                 style = {"color": f"C{k}", "alpha": 0.5 if kind == "linear" else 1.0, "label": f"{objective}, {kind}"}
                 axis.bar(place, heights, width, yerr=errors if any(errors) else None, **style)
         axis.set_xticks(range(len(names)), names)
