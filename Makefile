@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow format lint type check bench clean
+.PHONY: help setup demo test test-slow format lint type check bench figures clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -43,6 +43,9 @@ check: lint type test  ## all of the above that must be green
 
 bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
 	$(BIN)/python -m benchmarks.bench_envs
+
+figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about half an hour
+	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results
 
 clean:  ## remove the environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info

@@ -34,7 +34,8 @@ def check(folder, stem):
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure(name, tmp_path, capsys):
-    env_id = FIGURES[name].usual_ids[-1]
+    # Where it is quickest.
+    env_id = FIGURES[name].usual_ids[-1 if name in ("curves", "leak", "probes") else 0]
     size = ["-n", str(SIZES[name])] if name in SIZES else []
     analyze.main([name, "--env", env_id, "--images", str(tmp_path), "--trained", str(tmp_path), *size])
     results = check(tmp_path, f"{name}-{env_id}")

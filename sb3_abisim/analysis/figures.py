@@ -54,7 +54,7 @@ class Figure:
 
 FIGURES = {
     "perturbation": Figure(
-        "perturbation maps on Nav2D: single-step against multi-step", NAV2D_IDS, NAV2D_IDS[:1], 16,
+        "perturbation maps on Nav2D: single-step against multi-step", NAV2D_IDS, NAV2D_IDS[:1], 10,
         "layouts, four seconds each", perturbation.nav2d_maps, plots.draw_maps,
     ),
     "near-far": Figure(
@@ -62,7 +62,7 @@ FIGURES = {
         "layouts", perturbation.near_and_far, plots.draw_near_and_far,
     ),
     "structures": Figure(
-        "sensitivity within and beyond the reachable part of corridor and maze", NAV2D_IDS[1:], NAV2D_IDS[1:], 16,
+        "sensitivity within and beyond the reachable part of corridor and maze", NAV2D_IDS[1:], NAV2D_IDS[1:], 8,
         "layouts", perturbation.structure_maps, plots.draw_structures, trained=True,
     ),
     "pixels": Figure(
@@ -75,7 +75,7 @@ FIGURES = {
     ),
     "probes": Figure(
         "what probes read from embeddings, and the distractor-invariance ratio", ALL_IDS,
-        ("DistractorPointMaze-v0", "PointMaze-v0", "Nav2D-v0"), 500, "episodes to learn from", probes.probes,
+        ("DistractorPointMaze-v0", "PointMaze-v0", "Nav2D-v0"), 300, "episodes to learn from", probes.probes,
         plots_pixels.draw_probes, trained=True,
     ),
     "curves": Figure(
