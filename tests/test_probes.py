@@ -79,6 +79,21 @@ def test_invariance_by_what_an_encoder_sees():
     assert invariance_ratio(identity(SHAPE).encoder, sample_episodes("PointMaze-v0", 2, 2)) is None
 
 
+def test_shift_of_a_clip_that_is_all_an_encoder_sees():
+    samples = sample_episodes("DistractorPointMaze-v0", 8, 3)
+    encoder = identity(SHAPE).encoder
+    shifts = module.clip_shifts(encoder, samples, [samples])
+    shown = np.unique(samples.factors["clip"])
+    assert len(shifts) == len(shown)
+    pixels = samples.frames.reshape(len(samples), -1) / 255.0
+    centre = pixels.mean(axis=0)
+    unit = np.abs(pixels - centre).sum(axis=1).mean()
+    first = np.abs(pixels[samples.factors["clip"] == shown[0]].mean(axis=0) - centre).sum() / unit
+    assert next(iter(shifts.values())) == pytest.approx(first, rel=1e-3)
+    plain = sample_episodes("PointMaze-v0", 2, 2)
+    assert module.clip_shifts(encoder, plain, [plain]) == {}
+
+
 def test_table_over_seeds(monkeypatch):
     monkeypatch.setattr(module, "PROBES", ("linear",))
     mask = np.zeros((3, 15, 15))

@@ -109,7 +109,7 @@ def draw_maps(results: dict[str, Any], path: Path) -> None:
         image = show_map(axis, as_array(result["map"]), short_name(name), 7, "cells")
     figure.colorbar(image, ax=list(axes[:n]), shrink=0.8, label="relative to the largest")
     lines = {short_name(name): result["profile"] for name, result in encoders.items()}
-    show_profiles(axes[n], lines, results["bins"], "city-block distance of the toggled cell")
+    show_profiles(axes[n], lines, results["bins"], "city-block distance")
     figure.suptitle(f"Change of the embedding when one cell is toggled, {results['env_id']}", fontsize=10)
     save(figure, path)
 
@@ -128,7 +128,7 @@ def draw_sweep(results: dict[str, Any], path: Path) -> None:
         for axis, (name, result) in zip(axes[row], encoders.items(), strict=False):
             show_map(axis, as_array(result[f"{key}map"]), f"{label}, {name}", 7, "cells")
         lines = {name: result[f"{key}profile"] for name, result in encoders.items()}
-        show_profiles(axes[row, n], lines, results["bins"], "city-block distance of the toggled cell")
+        show_profiles(axes[row, n], lines, results["bins"], "city-block distance")
         axes[row, n].set_title(label, fontsize=9)
         axes[row, n].set_ylim(1e-3, 1.3)
     figure.suptitle("Action-bisimulation with several weights c of the recursive term, Nav2D-v0", fontsize=10)

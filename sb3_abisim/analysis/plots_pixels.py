@@ -36,6 +36,7 @@ def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
         _show_changes(row[n + 1], here)
     figure.suptitle(f"Change of the embedding when one obstacle moves by 1 m, {results['env_id']}", fontsize=10)
     save(figure, path)
+    _reduce_colours(path)
 
 
 def _show_changes(axis: Any, here: dict[str, Any]) -> None:
@@ -88,7 +89,7 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
 
 
 def _reduce_colours(path: Path) -> None:
-    """Photographs make large PNGs; a palette is a third of that."""
+    """Photographs and many panels make large PNGs; with a palette they take a third of that."""
     from PIL import Image
 
     with Image.open(path) as picture:

@@ -128,7 +128,7 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     :param seed: of the episodes and the untrained weights
     :return: per encoder: objective, seed, ``scores`` by setting
         (:func:`~sb3_abisim.analysis.pixels.clip_settings`), target and probe, and ``invariance`` by setting
-        (:func:`invariance_ratio`; None without clips)
+        (:func:`invariance_ratio`; None without clips), and ``clip_shifts``
     """
     # Before minutes of computing.
     _refuse_twins([_origin(file) for file in files.values()])
@@ -148,7 +148,8 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     for name, (encoder, origin) in encoders.items():
         scores = {setting: _scores(encoder, learn, test, setting) for setting in settings}
         ratios = {setting: invariance_ratio(encoder, test[setting]) for setting in settings}
-        results[name] = {**origin, "scores": scores, "invariance": ratios}
+        shifts = clip_shifts(encoder, next(iter(test.values())), list(test.values()))
+        results[name] = {**origin, "scores": scores, "invariance": ratios, "clip_shifts": shifts}
     return {"n_frames": len(pictures), "encoders": results, "groups": by_objective(results)}
 
 
@@ -199,6 +200,29 @@ def invariance_ratio(encoder: Encoder, samples: Samples, seed: int = 0) -> float
     elsewhere = embed(encoder, draw_point_mazes(agents[others], obstacles[others], behind))
     swapped = embed(encoder, draw_point_mazes(agents, obstacles, swapped_backgrounds(samples, generator)))
     return float((here - swapped).abs().sum(dim=1).mean() / (here - elsewhere).abs().sum(dim=1).mean())
+
+
+def clip_shifts(encoder: Encoder, reference: Samples, samples: list[Samples]) -> dict[str, float]:
+    """How far each clip moves the mean embedding, in units of the mean distance of states from their mean.
+
+    :param encoder: in evaluation mode
+    :param reference: of the clips of pretraining; its mean embedding is where distances are measured from
+    :param samples: of the clips to look at, with factors
+    :return: by name of the clip; empty without clips
+    """
+    features = embed(encoder, reference.frames)
+    centre = features.mean(dim=0)
+    unit = (features - centre).abs().sum(dim=1).mean()
+    shifts = {}
+    for one in samples:
+        clips = clips_of(one)
+        if clips is None:
+            continue
+        features = embed(encoder, one.frames)
+        shown = th.as_tensor(one.factors["clip"])
+        for k in np.unique(one.factors["clip"]).tolist():
+            shifts[clips.names[k]] = float((features[shown == k].mean(dim=0) - centre).abs().sum() / unit)
+    return shifts
 
 
 def by_objective(results: dict[str, Any]) -> dict[str, Any]:
