@@ -51,6 +51,7 @@ def _show_changes(axis: Any, here: dict[str, Any]) -> None:
     axis.axhline(1.0, color="0.5", lw=0.8, ls="--")
     axis.set_xticks(range(len(changes)), changes, fontsize=8)
     axis.set_ylabel("change (1: another state)")
+    axis.set_ylim(top=1.3 * axis.get_ylim()[1])
     axis.legend(fontsize=7)
 
 
@@ -109,7 +110,7 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
     # Of every target: what probes there are.
     kinds = list(next(iter(next(iter(settings.values())).values())))
     n = len(settings)
-    figure, axes = plt.subplots(1, n, figsize=(5.6 * n, 3.4), constrained_layout=True, squeeze=False)
+    figure, axes = plt.subplots(1, n, figsize=(max(6.0, 5.0 * n), 3.4), constrained_layout=True, squeeze=False)
     width = 0.8 / (len(groups) * len(kinds))
     for axis, (setting, names) in zip(axes[0], settings.items(), strict=True):
         for k, (objective, group) in enumerate(groups.items()):
@@ -125,7 +126,8 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
         axis.set_ylim(-0.2, 1.05)
         axis.grid(axis="y", alpha=0.3)
     axes[0, 0].set_ylabel("score (R², AUC, accuracy)")
-    axes[0, 0].legend(fontsize=7)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(kinds) * len(groups), fontsize=7)
     figure.suptitle(f"What probes read from the embedding, {results['env_id']}", fontsize=10)
     save(figure, path)
 
