@@ -73,8 +73,8 @@ class VecEncodeObservations(VecEnvWrapper):
         self.source = encoder
         self._device = get_device(device)
         # Channels last: small convolutions on a CPU are a quarter faster.
-        encoder = file.encoder.to(self._device, memory_format=th.channels_last)  # type: ignore[call-overload]
-        self._encoder: Encoder = encoder.requires_grad_(False)
+        network = file.encoder.to(self._device, memory_format=th.channels_last)  # type: ignore[call-overload]
+        self._encoder: Encoder = network.requires_grad_(False)
 
     @property
     def n_parameters(self) -> int:
