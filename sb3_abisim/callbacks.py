@@ -1,8 +1,10 @@
 """What an RL run says about its encoder."""
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 
 from sb3_abisim.extractors import find_extractors, require_weights
+from sb3_abisim.vec_env import VecEncodeObservations
 
 
 class EncoderCallback(BaseCallback):
@@ -26,7 +28,13 @@ class EncoderCallback(BaseCallback):
                 f"Encoder {name}: {type(extractor).__name__}, source {extractor.source}, {origin}, "
                 f"{extractor.n_parameters} parameters, {state}"
             )
-        if not self._extractors:
+        encoding = unwrap_vec_wrapper(self.training_env, VecEncodeObservations)
+        if encoding is not None:
+            print(
+                f"Encoder of the environment: {type(encoding).__name__}, source {encoding.source}, "
+                f"digest {encoding.encoder_file.digest}, {encoding.n_parameters} parameters, frozen"
+            )
+        elif not self._extractors:
             print("Encoder: none of sb3_abisim's, policy_kwargs names another features extractor")
         if self.training_env.has_attr("fingerprint"):
             (fingerprint,) = self.training_env.get_attr("fingerprint", indices=0)

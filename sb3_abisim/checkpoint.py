@@ -37,6 +37,8 @@ FORMAT = 1
 GOLDEN_TOLERANCE = 1e-4
 MAX_FILE_BYTES = 1 << 30
 HUB_PREFIX = "hf://"
+# A zoo run on a frozen encoder keeps a copy of its file under this name, in its folder <env id> beside config.yml.
+RUN_COPY = "encoder.safetensors"
 
 _METADATA_KEY = "sb3_abisim"
 _CONTRACT_KEYS = {

@@ -1,12 +1,14 @@
 """From a model trained on embeddings (``VecEncodeObservations``) to the equal one that acts on pictures."""
 
+import argparse
 import io
+from pathlib import Path
 from typing import Any, TypeVar
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 
-from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.checkpoint import RUN_COPY, load_encoder
 from sb3_abisim.dataset_format import space_from_json
 from sb3_abisim.extractors import extractor_class
 from sb3_abisim.vec_env import EncodedBox
@@ -69,3 +71,30 @@ def fuse(model: AlgorithmT, encoder: str) -> AlgorithmT:
     if fused.use_sde:
         fused.policy.reset_noise()  # type: ignore[operator]
     return fused
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Fuse a saved model.
+
+    :param argv: the program's arguments by default
+    """
+    from rl_zoo3 import ALGOS
+
+    parser = argparse.ArgumentParser(prog="python -m sb3_abisim.frozen", description=__doc__)
+    parser.add_argument("model", type=Path, help="zip of a model trained on a frozen encoder's embeddings")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="zip to write, for its algorithm's load()")
+    parser.add_argument("--algo", choices=sorted(ALGOS), required=True, help="algorithm, by rl-zoo3's name")
+    parser.add_argument("-e", "--encoder", help="encoder file (default: the copy in the zoo's run folder)")
+    args = parser.parse_args(argv)
+    encoder = args.encoder
+    if encoder is None:
+        copies = sorted(args.model.parent.glob(f"*/{RUN_COPY}"))
+        if len(copies) != 1:
+            parser.error(f"{args.model.parent} holds {len(copies)} encoder files */{RUN_COPY}; give --encoder")
+        encoder = str(copies[0])
+    fuse(ALGOS[args.algo].load(args.model, device="cpu"), encoder).save(args.output)
+    print(f"Wrote {args.output}, a model that acts on pictures")
+
+
+if __name__ == "__main__":
+    main()

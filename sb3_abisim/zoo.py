@@ -4,10 +4,13 @@
 ``python -m sb3_abisim.zoo train ...`` does. For the environment ids of this package, and for no others:
 
 * without ``--conf-file``, the hyperparameters are those of this package;
-* ``--conf-file METHOD[=ENCODER][,frozen]`` takes the same hyperparameters with another method's features extractor;
+* ``--conf-file METHOD[=ENCODER][,frozen]`` takes the same hyperparameters with another method's features extractor, or
+  frozen with ``VecEncodeObservations`` in its place;
+* several environments in one process are stepped as one batch (``LockstepVecEnv``);
 * evaluation of the Distractor environments is on unseen clips unless ``--eval-env-kwargs`` gives another split.
 
-``-optimize`` keeps a features extractor of this package, which rl-zoo3 alone would drop (rl-zoo3#431).
+The folder of a run on ``VecEncodeObservations`` holds a copy of the encoder file, which ``enjoy`` and ``record_video``
+use. ``-optimize`` keeps a features extractor of this package, which rl-zoo3 alone would drop (rl-zoo3#431).
 """
 
 import argparse
@@ -19,6 +22,7 @@ import importlib.util
 import inspect
 import re
 import runpy
+import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,6 +45,7 @@ EXTRACTORS = {
     "vanilla": "VanillaExtractor",
 }
 UNTRAINED = ("vanilla",)
+ENCODING_WRAPPER = "sb3_abisim.vec_env.VecEncodeObservations"
 DISTRACTOR_IDS = tuple(env_id for env_id in ENV_IDS if "Distractor" in env_id)
 
 _SCRIPTS = {
@@ -89,28 +94,34 @@ class Method:
         head, equals, encoder = text.removesuffix(",frozen").partition("=")
         return cls(head, encoder if equals else None, frozen=text.endswith(",frozen"))
 
-    def policy_kwargs(self, text: str) -> str:
-        """The ``policy_kwargs`` of a YAML entry with this method's features extractor; all else stays.
+    def hyperparameters(self, entry: dict[str, Any]) -> dict[str, Any]:
+        """What this method puts in place of a YAML entry's values; all else stays.
 
-        :param text: ``dict(...)`` as rl-zoo3 evaluates it, naming a shipped encoder ("Nav2D-v0/abisim")
-        :raises ValueError: when it has another form
+        :param entry: with ``policy_kwargs`` that read ``dict(...)``, as rl-zoo3 evaluates them, and name a shipped
+            encoder ("Nav2D-v0/abisim")
+        :return: ``policy_kwargs``, and for a frozen encoder ``policy`` and ``vec_env_wrapper``
+        :raises ValueError: when ``policy_kwargs`` have another form
         """
+        text = str(entry["policy_kwargs"])
         try:
             call = ast.parse(text.strip(), mode="eval").body
             assert isinstance(call, ast.Call) and ast.unparse(call.func) == "dict" and not call.args
             values = {str(keyword.arg): ast.unparse(keyword.value) for keyword in call.keywords}
-            shipped = ast.literal_eval(values["features_extractor_kwargs"])["encoder"]
+            shipped = ast.literal_eval(values.pop("features_extractor_kwargs"))["encoder"]
+            del values["features_extractor_class"]
         except (SyntaxError, AssertionError, KeyError, TypeError, ValueError) as error:
             form = "dict(features_extractor_class=..., features_extractor_kwargs={'encoder': ...}, ...)"
             raise ValueError(f"policy_kwargs must read {form}, got {text!r}") from error
-        values["features_extractor_class"] = f"get_class_by_name('sb3_abisim.extractors.{EXTRACTORS[self.name]}')"
-        if self.name in UNTRAINED:
-            del values["features_extractor_kwargs"]
+        encoder = self.encoder or f"{shipped.rpartition('/')[0]}/{self.name}"
+        others: dict[str, Any] = {}
+        if self.frozen:
+            wrapper = {ENCODING_WRAPPER: {"encoder": encoder, "objective": self.name}}
+            others = {"policy": entry["policy"].replace("Cnn", "Mlp"), "vec_env_wrapper": [wrapper]}
         else:
-            encoder = self.encoder or f"{shipped.rpartition('/')[0]}/{self.name}"
-            kwargs = {"encoder": encoder, "freeze": True} if self.frozen else {"encoder": encoder}
-            values["features_extractor_kwargs"] = repr(kwargs)
-        return f"dict({', '.join(f'{name}={value}' for name, value in values.items())})"
+            values["features_extractor_class"] = f"get_class_by_name('sb3_abisim.extractors.{EXTRACTORS[self.name]}')"
+            if self.name not in UNTRAINED:
+                values["features_extractor_kwargs"] = repr({"encoder": encoder})
+        return {"policy_kwargs": f"dict({', '.join(f'{name}={value}' for name, value in values.items())})", **others}
 
 
 def hyperparameters_file(algo: str, env_id: str) -> Path:
@@ -147,12 +158,15 @@ def install() -> None:
     zoo_folder = Path(inspect.getfile(manager_class)).parent / "hyperparams"
     manager_class.read_hyperparameters = _reader(manager_class.read_hyperparameters, zoo_folder)
     manager_class.hyperparameters_optimization = _optimizer(manager_class.hyperparameters_optimization)
-    plain = importlib.import_module("rl_zoo3.utils").create_test_env
-    wrapped = _test_env_maker(plain)
-    # `from ... import` has copied the name into several modules.
-    for module in list(sys.modules.values()):
-        if getattr(module, "__dict__", {}).get("create_test_env") is plain:
-            module.create_test_env = wrapped  # type: ignore[attr-defined]
+    manager_class._save_config = _config_saver(manager_class._save_config)
+    utils = importlib.import_module("rl_zoo3.utils")
+    for name, wrap in (("create_test_env", _test_env_maker), ("get_saved_hyperparams", _saved_reader)):
+        plain = getattr(utils, name)
+        wrapped = wrap(plain)
+        # `from ... import` has copied the name into several modules.
+        for module in list(sys.modules.values()):
+            if getattr(module, "__dict__", {}).get(name) is plain:
+                setattr(module, name, wrapped)
 
 
 def _entries(path: Path) -> dict[str, Any]:
@@ -186,11 +200,13 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
             self.config = str(hyperparameters_file(self.algo, env_id))
         if method is not None:
             custom = self.custom_hyperparams or {}
-            if "policy_kwargs" in custom:
-                raise ValueError(f"-params policy_kwargs would undo --conf-file {method.name}; give one of the two")
-            text = method.policy_kwargs(_entries(Path(self.config))[env_id]["policy_kwargs"])
-            self.custom_hyperparams = {**custom, "policy_kwargs": text}
+            replaced = method.hyperparameters(_entries(Path(self.config))[env_id])
+            for name in sorted(custom.keys() & replaced.keys()):
+                raise ValueError(f"-params {name} would undo --conf-file {method.name}; give one of the two")
+            self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = original(self)
+        if hyperparams.get("n_envs", 1) > 1 and "env_wrapper" not in hyperparams:
+            self.vec_env_class = _in_lockstep(self.vec_env_class)
         # Hyperparameters are selected on the training clips, so that evaluation clips stay unseen.
         if env_id in DISTRACTOR_IDS and not self.optimize_hyperparameters:
             given = self._eval_env_kwargs_args
@@ -213,6 +229,49 @@ def _test_env_maker(original: Callable[..., Any]) -> Callable[..., Any]:
         return original(env_id, *args, **kwargs)
 
     return create_test_env
+
+
+def _in_lockstep(vec_env_class: type) -> type:
+    """The faster equal of ``DummyVecEnv``; any other choice stays."""
+    is_default = vec_env_class is importlib.import_module("stable_baselines3.common.vec_env").DummyVecEnv
+    return importlib.import_module("sb3_abisim.lockstep").LockstepVecEnv if is_default else vec_env_class
+
+
+def _encoding_kwargs(hyperparams: dict[str, Any]) -> dict[str, Any] | None:
+    """The arguments of ``VecEncodeObservations`` in a zoo entry, None where it is not used."""
+    wrappers = hyperparams.get("vec_env_wrapper")
+    for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
+        if isinstance(wrapper, dict) and ENCODING_WRAPPER in wrapper:
+            kwargs: dict[str, Any] = wrapper[ENCODING_WRAPPER]
+            return kwargs
+    return None
+
+
+def _config_saver(original: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def _save_config(self: Any, saved_hyperparams: dict[str, Any]) -> None:
+        original(self, saved_hyperparams)
+        kwargs = _encoding_kwargs(saved_hyperparams)
+        if kwargs is not None:
+            checkpoint = importlib.import_module("sb3_abisim.checkpoint")
+            copied = Path(self.params_path) / checkpoint.RUN_COPY
+            shutil.copyfile(checkpoint.resolve_encoder(kwargs["encoder"]), copied)
+
+    return _save_config
+
+
+def _saved_reader(original: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def get_saved_hyperparams(stats_path: str, *args: Any, **kwargs: Any) -> Any:
+        hyperparams, found = original(stats_path, *args, **kwargs)
+        encoding = _encoding_kwargs(hyperparams)
+        if encoding is not None:
+            copied = Path(stats_path) / importlib.import_module("sb3_abisim.checkpoint").RUN_COPY
+            if copied.is_file():
+                encoding["encoder"] = str(copied)
+        return hyperparams, found
+
+    return get_saved_hyperparams
 
 
 def _optimizer(original: Callable[..., Any]) -> Callable[..., Any]:

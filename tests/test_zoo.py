@@ -76,7 +76,7 @@ def test_wrong_method_words(text: str) -> None:
 )
 def test_policy_kwargs_of_another_form_are_refused(text: str) -> None:
     with pytest.raises(ValueError, match="policy_kwargs must read"):
-        zoo.Method("ssi").policy_kwargs(text)
+        zoo.Method("ssi").hyperparameters({"policy": "CnnPolicy", "policy_kwargs": text})
 
 
 @pytest.mark.parametrize(("algo", "env_id"), ENTRIES)
@@ -87,7 +87,6 @@ def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: 
     assert kwargs["features_extractor_class"].__name__ == "ActionBisimExtractor"
     for word, class_name, expected in [
         ("abisim", "ActionBisimExtractor", {"encoder": shipped}),
-        ("abisim,frozen", "ActionBisimExtractor", {"encoder": shipped, "freeze": True}),
         *((name, zoo.EXTRACTORS[name], {"encoder": shipped.replace("/abisim", f"/{name}")}) for name in PRETRAINED),
         ("ssi=my runs/x.safetensors", "SSIExtractor", {"encoder": "my runs/x.safetensors"}),
         ("vanilla", "VanillaExtractor", None),
@@ -99,6 +98,41 @@ def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: 
         assert other_kwargs.get("features_extractor_kwargs") == expected
         differing = {key for key in kwargs | other_kwargs if kwargs.get(key) != other_kwargs.get(key)}
         assert differing <= {"features_extractor_class", "features_extractor_kwargs"}
+
+
+@pytest.mark.parametrize(("algo", "env_id"), ENTRIES)
+def test_frozen_puts_the_encoder_into_the_environment(manager: Any, algo: str, env_id: str) -> None:
+    default = effective(manager(algo, env_id))
+    kwargs = default.pop("policy_kwargs")
+    shipped = kwargs["features_extractor_kwargs"]["encoder"]
+    for word, encoder, objective in [
+        ("abisim,frozen", shipped, "abisim"),
+        ("ssi,frozen", shipped.replace("/abisim", "/ssi"), "ssi"),
+        ("ssi=my runs/x.safetensors,frozen", "my runs/x.safetensors", "ssi"),
+    ]:
+        _, saved = manager(algo, env_id, word).read_hyperparameters()
+        assert saved["vec_env_wrapper"] == [
+            {"sb3_abisim.vec_env.VecEncodeObservations": {"encoder": encoder, "objective": objective}}
+        ]
+        frozen = effective(manager(algo, env_id, word))
+        # The network behind the encoder and all else are the same.
+        head = {key: value for key, value in kwargs.items() if not key.startswith("features_extractor")}
+        assert frozen.pop("policy_kwargs") == head
+        assert frozen == default | {"policy": "MlpPolicy"}
+
+
+def test_several_environments_are_stepped_as_one(manager: Any, tmp_path: Path) -> None:
+    def vec_env_class(algo: str, env_id: str = "Nav2D-v0", config: str | None = None, **kwargs: Any) -> str:
+        one = manager(algo, env_id, config, **kwargs)
+        one.read_hyperparameters()
+        return str(one.vec_env_class.__name__)
+
+    (tmp_path / "own.yml").write_text("Nav2D-v0: {n_envs: 4, n_timesteps: 7, env_wrapper: some.Wrapper}\n")
+    assert vec_env_class("ppo") == vec_env_class("ppo", config="vanilla") == "LockstepVecEnv"
+    assert vec_env_class("dqn") == vec_env_class("ppo", hyperparams={"n_envs": 1}) == "DummyVecEnv"
+    assert vec_env_class("ppo", config=str(tmp_path / "own.yml")) == "DummyVecEnv"
+    assert vec_env_class("ppo", vec_env_type="subproc") == "SubprocVecEnv"
+    assert vec_env_class("ppo", "CartPole-v1") == "DummyVecEnv"
 
 
 # Hyperparameters.
@@ -185,6 +219,8 @@ def test_mistakes_are_refused(manager: Any) -> None:
         manager("ppo", "Nav2D-v0", "abisin").read_hyperparameters()
     with pytest.raises(ValueError, match="give one of the two"):
         manager("ppo", "Nav2D-v0", "ssi", hyperparams={"policy_kwargs": "dict()"}).read_hyperparameters()
+    with pytest.raises(ValueError, match="-params vec_env_wrapper would undo"):
+        manager("ppo", "Nav2D-v0", "ssi,frozen", hyperparams={"vec_env_wrapper": []}).read_hyperparameters()
     with pytest.raises(ValueError, match="--trial-id would replace policy_kwargs"):
         manager("ppo", "Nav2D-v0", trial_id=3).read_hyperparameters()
 

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch as th
+from stable_baselines3 import PPO
 from torch import nn
 from zoo_inputs import SMALL, write_encoder
 
-from sb3_abisim import zoo
+from sb3_abisim import frozen, zoo
 from sb3_abisim.checkpoint import load_encoder
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
@@ -56,7 +58,7 @@ def test_train_and_enjoy(
     # One line for each network with an encoder of its own.
     assert out.count("Encoder ") == (2 if algo == "sac" else 1)
     assert f"digest {digest}" in out if digest else "random weights" in out
-    assert state in out and "| encoder/ " in out
+    assert state in out and (state == "frozen" or "| encoder/ " in out)
     folder = tmp_path / algo / f"{env_id}_1"
     evaluations = np.load(folder / "evaluations.npz")
     assert evaluations["successes"].shape == (1, 1)
@@ -67,10 +69,46 @@ def test_train_and_enjoy(
     assert "Mean reward" in capsys.readouterr().out
 
 
+def test_a_frozen_run_acts_on_the_encoder_it_was_trained_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Its folder, moved elsewhere, with another encoder now under the old name; fused, without any encoder file."""
+    encoder = tmp_path / "mine.safetensors"
+    digest = write_encoder(encoder, "Nav2D-v0")
+    argv = ["--algo", "ppo", "--env", "Nav2D-v0", "--num-threads", "1"]
+    small = ["-n", "64", "--eval-freq", "-1", "-params", *SMALL["ppo"]]
+    run(monkeypatch, "train", *argv, "-f", str(tmp_path / "logs"), "--conf-file", f"abisim={encoder},frozen", *small)
+    write_encoder(encoder, "Nav2D-v0", "ssi")
+    (tmp_path / "logs").rename(tmp_path / "moved")
+    enjoy = importlib.import_module("rl_zoo3.enjoy")
+    seen: list[str] = []
+    make = enjoy.create_test_env
+    monkeypatch.setattr(
+        importlib.import_module("rl_zoo3"),
+        "create_test_env",
+        lambda *args, **kwargs: seen.append(env := make(*args, **kwargs)) or env,  # type: ignore[func-returns-value]
+    )
+    run(monkeypatch, "enjoy", *argv, "-f", str(tmp_path / "moved"), "-n", "60", "--no-render")
+    capsys.readouterr()
+    assert seen[0].encoder_file.digest == digest  # type: ignore[attr-defined]
+    folder = tmp_path / "moved" / "ppo" / "Nav2D-v0_1"
+    frozen.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-o", str(tmp_path / "fused.zip")])
+    model = PPO.load(tmp_path / "fused.zip", device="cpu")
+    assert model.policy.features_extractor.digest == digest
+    on_embeddings = PPO.load(folder / "Nav2D-v0.zip", device="cpu")
+    frames = np.random.default_rng(0).integers(0, 256, (20, 3, 15, 15), np.uint8)
+    with th.no_grad():
+        expected = on_embeddings.policy.predict_values(model.policy.features_extractor(th.from_numpy(frames) / 255))
+        assert th.allclose(model.policy.predict_values(th.from_numpy(frames)), expected, atol=1e-5)
+    with pytest.raises(FileNotFoundError, match="mistyped"):
+        frozen.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-e", "mistyped", "-o", str(tmp_path / "x.zip")])
+
+
 def test_a_mistyped_encoder_stops_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     argv = ["train", "--algo", "dqn", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "300", "--eval-freq", "-1"]
-    with pytest.raises(FileNotFoundError, match=r"no encoder file 'tpyo\.safetensors'"):
-        run(monkeypatch, *argv, "--conf-file", "abisim=tpyo.safetensors", "-params", *SMALL["dqn"])
+    for word in ("abisim=tpyo.safetensors", "abisim=tpyo.safetensors,frozen"):
+        with pytest.raises(FileNotFoundError, match=r"no encoder file 'tpyo\.safetensors'"):
+            run(monkeypatch, *argv, "--conf-file", word, "-params", *SMALL["dqn"])
 
 
 def test_optimize_keeps_the_encoder(
