@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow format lint type check bench figures clean
+.PHONY: help setup demo test test-slow format lint type check bench figures benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -46,6 +46,18 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 
 figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about half an hour
 	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results
+
+benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
+	$(BIN)/python -m sb3_abisim.benchmark -o benchmark
+
+# Budgets that show that the machinery works, and nothing about the methods.
+SMOKE := --env Nav2D-v0 DistractorPointMaze-v0 --methods abisim ssi vanilla --seeds 0 1 --n-transitions 2000 \
+	-n 1024 --eval-freq 256 --eval-episodes 3 --n-eval-envs 3 --final-episodes 4 --device cpu \
+	--pretrain-params n_updates:20 log_interval:10 checkpoint_interval:10 batch_size:64 \
+	--params dqn.learning_starts:100 ppo.n_envs:4 ppo.n_steps:64 ppo.batch_size:64 ppo.n_epochs:2
+
+benchmark-smoke: setup  ## the same graph and report with tiny budgets, in minutes, into benchmark-smoke/
+	$(BIN)/python -m sb3_abisim.benchmark -o benchmark-smoke $(SMOKE)
 
 clean:  ## remove the environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info

@@ -238,7 +238,7 @@ def _threshold_rows(
                 for label, group in methods.items()
             }
             for label in methods:
-                if label == reference and len(methods) > 1:
+                if label == reference:
                     continue
                 ratio = statistics.steps_ratio(steps[reference], steps[label], horizon, seed)
                 rows.append(

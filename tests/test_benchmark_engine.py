@@ -1,0 +1,145 @@
+"""Cells run in order, once, by one writer at a time, and die with their engine."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import Future
+from pathlib import Path
+
+import pytest
+
+from sb3_abisim.atomic import FolderLockedError, folder_lock, write_atomic
+from sb3_abisim.benchmark.cell import CellError, is_done
+from sb3_abisim.benchmark.engine import LocalEngine, make_engine, run_cells
+from sb3_abisim.benchmark.graph import Cell
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def cell(name: str, *inputs: Cell, command: tuple[str, ...] = ()) -> Cell:
+    return Cell("encoder", name, {"objective": "ssi", "env_id": "E", "name": name}, inputs, command, f"{name}.zip")
+
+
+class FakeEngine:
+    """Does what the test says, at once."""
+
+    n_slots = 1
+
+    def __init__(self, failing: str = "") -> None:
+        self.failing, self.ran, self.closed = failing, [], False
+
+    def submit(self, root: Path, cell: Cell) -> "Future[None]":
+        import json
+
+        from sb3_abisim.atomic import file_digest
+
+        self.ran.append(cell.title)
+        future: Future[None] = Future()
+        if cell.title == self.failing:
+            future.set_exception(CellError("broken on purpose"))
+            return future
+        (root / cell.output).write_text(cell.title)
+        (root / "cells").mkdir(exist_ok=True)
+        marker = {**cell.to_json(), "digest": file_digest(root / cell.output), "seconds": 1.0}
+        write_atomic(root / "cells" / f"{cell.name}.json", lambda file: file.write(json.dumps(marker).encode()))
+        future.set_result(None)
+        return future
+
+    def close(self) -> None:
+        self.closed = True
+
+
+A = cell("a")
+B = cell("b", A)
+C = cell("c", A)
+D = cell("d", B, C)
+CELLS = [A, B, C, D]
+
+
+def test_inputs_first_and_a_rerun_does_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    engine = FakeEngine()
+    assert run_cells(tmp_path, CELLS, engine) == {} and engine.closed
+    assert engine.ran == ["a", "b", "c", "d"]
+    assert "4 of 4 cells done, 0 of them before; 0 failed" in capsys.readouterr().err
+    engine = FakeEngine()
+    assert run_cells(tmp_path, CELLS, engine) == {} and engine.ran == []
+    (tmp_path / "c.zip").write_text("damaged")
+    (tmp_path / "b.zip").unlink()
+    run_cells(tmp_path, CELLS, engine, progress=False)
+    assert engine.ran == ["b", "c"], "nothing but what is not as it was made"
+
+
+def test_a_failure_takes_with_it_only_what_depends_on_it(tmp_path: Path) -> None:
+    engine = FakeEngine(failing="b")
+    assert run_cells(tmp_path, CELLS, engine, progress=False) == {"b": "broken on purpose"}
+    assert engine.ran == ["a", "b", "c"]
+    engine = FakeEngine()
+    assert run_cells(tmp_path, CELLS, engine, progress=False) == {} and engine.ran == ["b", "d"]
+
+
+def test_two_writers_are_refused(tmp_path: Path) -> None:
+    engine = FakeEngine()
+    with folder_lock(tmp_path), pytest.raises(FolderLockedError, match="is being written by process"):
+        run_cells(tmp_path, CELLS, engine, progress=False)
+    assert engine.ran == [] and engine.closed
+
+
+def test_a_cell_in_a_program_of_its_own(tmp_path: Path) -> None:
+    good = cell("good", command=("zipfile", "-c", "good.zip", "good.txt"))
+    (tmp_path / "good.txt").write_text("x")
+    bad = cell("bad", command=("zipfile", "-c", "bad.zip", "no_such_file"))
+    engine = LocalEngine(1)
+    errors = run_cells(tmp_path, [bad, good], engine, progress=False)
+    assert is_done(tmp_path, good.to_json()) and not is_done(tmp_path, bad.to_json())
+    log = (tmp_path / "logs" / f"{bad.name}.log").read_text()
+    assert "$ python -m zipfile -c bad.zip no_such_file" in log
+    assert list(errors) == ["bad"] and str(tmp_path / "logs" / f"{bad.name}.log") in errors["bad"]
+
+
+DRIVER = """
+import pathlib, sys
+from sb3_abisim.benchmark.cell import launch
+cell = {"name": "encoder-0", "kind": "encoder", "title": "t", "settings": {}, "inputs": [], "proof": "", "units": 1,
+        "output": "never", "command": ["http.server", "0", "--bind", "127.0.0.1"]}
+launch(pathlib.Path(sys.argv[1]), cell, 1)
+"""
+
+
+def test_a_killed_engine_leaves_no_orphan(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    driver = subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)], env=environment)
+    try:
+        wait_until(lambda: _programs(tmp_path) == 2, "the cell's program and its command run")
+    finally:
+        driver.send_signal(signal.SIGKILL)
+        driver.wait()
+    wait_until(lambda: _programs(tmp_path) == 0, "both are gone")
+    with folder_lock(tmp_path / "work" / "encoder-0"):
+        pass
+
+
+def wait_until(condition, what: str, seconds: float = 60) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.1)
+
+
+def _programs(folder: Path) -> int:
+    """How many Python programs work in a folder."""
+    count = 0
+    for process in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if process.name.isdigit() and os.readlink(process / "cwd") == str(folder.resolve()):
+                count += b"python" in (process / "cmdline").read_bytes()
+    return count
+
+
+def test_unknown_engines_are_refused() -> None:
+    with pytest.raises(ValueError, match="'local' or 'ray', got 'slurm'"):
+        make_engine("slurm", 1, 1)
+    with pytest.raises(ValueError, match="n_jobs must be at least 1, got 0"):
+        LocalEngine(0)
