@@ -88,14 +88,14 @@ def test_two_writers_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_cell_in_a_program_of_its_own(tmp_path: Path) -> None:
-    good = cell("good", command=("zipfile", "-c", "good.zip", "good.txt"))
-    (tmp_path / "good.txt").write_text("x")
-    bad = cell("bad", command=("zipfile", "-c", "bad.zip", "no_such_file"))
+    good = cell("good", command=("json.tool", "good.json", "good.zip"))
+    (tmp_path / "good.json").write_text("{}")
+    bad = cell("bad", command=("json.tool", "no_such_file", "bad.zip"))
     engine = LocalEngine(1)
     errors = run_cells(tmp_path, [bad, good], engine, progress=False)
     assert is_done(tmp_path, good.to_json()) and not is_done(tmp_path, bad.to_json())
     log = (tmp_path / "logs" / f"{bad.name}.log").read_text()
-    assert "$ python -m zipfile -c bad.zip no_such_file" in log
+    assert "$ python -m json.tool no_such_file bad.zip" in log
     assert list(errors) == ["bad"] and str(tmp_path / "logs" / f"{bad.name}.log") in errors["bad"]
 
 

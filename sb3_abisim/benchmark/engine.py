@@ -95,7 +95,7 @@ def run_cells(root: Path, cells: Sequence[Cell], engine: Engine, progress: bool 
 
 class _Run:
     def __init__(self, root: Path, cells: Sequence[Cell], engine: Engine, progress: bool) -> None:
-        self.root, self.cells, self.engine = root, cells, engine
+        self.root, self.cells, self.engine, self.progress = root, cells, engine, progress
         self.done = {cell.name for cell in cells if is_done(root, cell.to_json())}
         self.running: dict[Future[None], tuple[Cell, float]] = {}
         self.waiting = [cell for cell in cells if cell.name not in self.done]
@@ -119,7 +119,7 @@ class _Run:
                 self._show()
         finally:
             self.bar.close()
-        if not self.bar.disable:
+        if self.progress:
             state = f"{len(self.done)} of {len(self.cells)} cells done, {n_kept} of them before"
             print(f"{state}; {len(self.errors)} failed", file=sys.stderr)
         return self.errors
