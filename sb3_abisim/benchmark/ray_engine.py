@@ -10,12 +10,14 @@ import socket
 import time
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sb3_abisim._version import __version__
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark.cell import CellError, launch
-from sb3_abisim.benchmark.graph import Cell
+
+if TYPE_CHECKING:
+    from sb3_abisim.benchmark.graph import Cell  # at run time it would load PyTorch into each of Ray's workers
 
 
 class RayEngine:
@@ -50,7 +52,7 @@ class RayEngine:
         self.n_slots, self.threads = n_jobs or room, threads
         self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": retries}
 
-    def submit(self, root: Path, cell: Cell) -> "Future[None]":
+    def submit(self, root: Path, cell: "Cell") -> "Future[None]":
         """Hand a cell to the cluster."""
         root = root.resolve()
         token = root / "shared_folder"
