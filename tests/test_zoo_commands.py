@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 from torch import nn
 from zoo_inputs import SMALL, write_encoder
 
 from sb3_abisim import frozen, zoo
 from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.vec_env import VecEncodeObservations
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
 
@@ -80,17 +82,19 @@ def test_a_frozen_run_acts_on_the_encoder_it_was_trained_on(
     run(monkeypatch, "train", *argv, "-f", str(tmp_path / "logs"), "--conf-file", f"abisim={encoder},frozen", *small)
     write_encoder(encoder, "Nav2D-v0", "ssi")
     (tmp_path / "logs").rename(tmp_path / "moved")
-    enjoy = importlib.import_module("rl_zoo3.enjoy")
-    seen: list[str] = []
-    make = enjoy.create_test_env
-    monkeypatch.setattr(
-        importlib.import_module("rl_zoo3"),
-        "create_test_env",
-        lambda *args, **kwargs: seen.append(env := make(*args, **kwargs)) or env,  # type: ignore[func-returns-value]
-    )
+    seen: list[Any] = []
+    rl_zoo3 = importlib.import_module("rl_zoo3")
+    make = rl_zoo3.create_test_env
+
+    def create_test_env(*args: Any, **kwargs: Any) -> Any:
+        seen.append(make(*args, **kwargs))
+        return seen[-1]
+
+    monkeypatch.setattr(rl_zoo3, "create_test_env", create_test_env)
     run(monkeypatch, "enjoy", *argv, "-f", str(tmp_path / "moved"), "-n", "60", "--no-render")
     capsys.readouterr()
-    assert seen[0].encoder_file.digest == digest  # type: ignore[attr-defined]
+    encoding = unwrap_vec_wrapper(seen[0], VecEncodeObservations)
+    assert encoding is not None and encoding.encoder_file.digest == digest
     folder = tmp_path / "moved" / "ppo" / "Nav2D-v0_1"
     frozen.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-o", str(tmp_path / "fused.zip")])
     model = PPO.load(tmp_path / "fused.zip", device="cpu")
