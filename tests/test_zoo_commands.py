@@ -108,6 +108,8 @@ def test_a_frozen_run_acts_on_the_encoder_it_was_trained_on(
         frozen.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-e", "mistyped", "-o", str(tmp_path / "x.zip")])
 
 
+# The zoo has already opened its monitor files when it wraps the environment.
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_mistyped_encoder_stops_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     argv = ["train", "--algo", "dqn", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "300", "--eval-freq", "-1"]
     for word in ("abisim=tpyo.safetensors", "abisim=tpyo.safetensors,frozen"):
