@@ -43,6 +43,8 @@ check: lint type test  ## all of the above that must be green
 
 bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
 	$(BIN)/python -m benchmarks.bench_envs
+	$(BIN)/python -m benchmarks.bench_pretrain
+	$(BIN)/python -m benchmarks.bench_frozen
 
 figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about half an hour
 	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results

@@ -1,0 +1,114 @@
+"""Speed of RL on a frozen encoder: through the pixels beside ``VecEncodeObservations``, in turns within one run.
+
+PPO on ``DistractorPointMaze-v0`` and DQN on ``Nav2D-v0`` with the hyperparameters of ``hyperparams/`` (PPO with shorter
+rollouts, so that a turn holds several). Steps per second of processor time on one thread, which load on the machine
+disturbs less than the clock; the speed of each is that of its fastest turn. ``make bench``.
+"""
+
+import argparse
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results" / "frozen.md"
+AIM = 5.0
+N_STEPS = 128
+PPO = {"n_steps": N_STEPS, "batch_size": 256, "learning_rate": 2.5e-5}
+DQN = {
+    "batch_size": 32,
+    "learning_rate": 1e-4,
+    "exploration_initial_eps": 0.9,
+    "exploration_final_eps": 0.2,
+    "buffer_size": 20_000,
+    "learning_starts": 100,
+}
+
+
+def make_model(algo: str, encoded: bool) -> Any:
+    """A model of the zoo's hyperparameters on a frozen encoder.
+
+    :param algo: "ppo" or "dqn"
+    :param encoded: whether the environment embeds
+    """
+    import gymnasium as gym
+    import stable_baselines3 as sb3
+    from torch import nn
+
+    from sb3_abisim import ActionBisimExtractor
+    from sb3_abisim.lockstep import LockstepVecEnv
+    from sb3_abisim.vec_env import VecEncodeObservations
+
+    env_id, n_envs = ("DistractorPointMaze-v0", 16) if algo == "ppo" else ("Nav2D-v0", 1)
+    vec_env_class = LockstepVecEnv if n_envs > 1 else sb3.common.vec_env.DummyVecEnv
+    env = vec_env_class([lambda: gym.make(env_id)] * n_envs)
+    policy_kwargs: dict[str, Any] = {"net_arch": [256], "activation_fn": nn.ReLU}
+    if encoded:
+        env = VecEncodeObservations(env, f"{env_id}/abisim", device="cpu")
+    else:
+        policy_kwargs["features_extractor_class"] = ActionBisimExtractor
+        policy_kwargs["features_extractor_kwargs"] = {"encoder": f"{env_id}/abisim", "freeze": True}
+    if algo == "ppo":
+        env = sb3.common.vec_env.VecNormalize(env, norm_obs=False)
+    policy, kwargs = ("MlpPolicy" if encoded else "CnnPolicy"), (PPO if algo == "ppo" else DQN)
+    model_class = {"ppo": sb3.PPO, "dqn": sb3.DQN}[algo]
+    return model_class(policy, env, policy_kwargs=policy_kwargs, device="cpu", seed=0, **kwargs)
+
+
+def turns(model: Any, n_steps: int) -> Callable[[], float]:
+    """A function that trains for ``n_steps`` and returns the steps per second of processor time."""
+    model.learn(n_steps)
+
+    def run() -> float:
+        start = time.process_time()
+        model.learn(n_steps, reset_num_timesteps=False)
+        return n_steps / (time.process_time() - start)
+
+    return run
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure and write the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_frozen", description=__doc__)
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="Markdown file (default: %(default)s)")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each contender (default: %(default)s)")
+    args = parser.parse_args(argv)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    rows = []
+    for algo, n_steps, title in (
+        ("ppo", 16 * N_STEPS, "PPO, DistractorPointMaze-v0"),
+        ("dqn", 1_000, "DQN, Nav2D-v0"),
+    ):
+        runs = {encoded: turns(make_model(algo, encoded), n_steps) for encoded in (False, True)}
+        speeds = dict.fromkeys(runs, 0.0)
+        for _ in range(args.rounds):
+            for encoded, run in runs.items():
+                speeds[encoded] = max(speeds[encoded], run())
+        row = (
+            f"| {title} | {speeds[False]:,.0f} | {speeds[True]:,.0f} | {speeds[True] / speeds[False]:.1f} | {AIM:.0f} |"
+        )
+        print(row, flush=True)
+        rows.append(row)
+    text = "\n".join(
+        [
+            "# Speed of RL on a frozen encoder",
+            "",
+            f"`python -m benchmarks.bench_frozen` on one core of {platform.machine()}, Python "
+            f"{platform.python_version()}: steps per second of processor time, fastest of {args.rounds} turns.",
+            "",
+            "| algorithm, environment | through the pixels | `VecEncodeObservations` | ratio | aim |",
+            "|---|---:|---:|---:|---:|",
+            *rows,
+            "",
+        ]
+    )
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    args.output.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
