@@ -169,9 +169,8 @@ def main(argv: list[str] | None = None) -> None:
                 parts = ", ".join(f"{name} {share:.0%}" for name, share in shares(runs[2], 2 * args.updates).items())
                 ratio = speed["ours"] / speed["plain"]
                 label = f"`{objective}`, {env_id}"
-                rows.append(
-                    f"| {label} | {speed['plain']:,.0f} | {speed['ours']:,.0f} | {ratio:.1f} | {AIM:.0f} | {flops:.0f} |"
-                )
+                plain, fast = speed["plain"], speed["ours"]
+                rows.append(f"| {label} | {plain:,.0f} | {fast:,.0f} | {ratio:.1f} | {AIM:.0f} | {flops:.0f} |")
                 notes.append(f"* {label}: {parts}")
                 print(rows[-1], notes[-1], flush=True)
     text = "\n".join(
