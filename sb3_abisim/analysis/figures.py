@@ -174,13 +174,15 @@ def write_figure(results: dict[str, Any], draw: Draw, images: Path, numbers: Pat
     :param numbers: folder for the JSON
     """
     stem = f"{results['figure']}-{results['env_id']}"
-    kept = {key: value for key, value in results.items() if key != "pictures"}
-    text = json.dumps(_plain(kept), indent=1, allow_nan=False)
+    pictures = {key: value for key, value in results.items() if key == "pictures"}
+    plain = _plain({key: value for key, value in results.items() if key != "pictures"})
+    text = json.dumps(plain, indent=1, allow_nan=False)
     # Each innermost list on one line: a map has hundreds of numbers.
     text = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
     numbers.mkdir(parents=True, exist_ok=True)
     write_atomic(numbers / f"{stem}.json", lambda file: file.write(text.encode()))
-    draw(results, images / f"{stem}.png")
+    # From the numbers as they were written, so that the file alone gives the same figure.
+    draw(plain | pictures, images / f"{stem}.png")
     return images / f"{stem}.png"
 
 
