@@ -9,11 +9,12 @@ import time
 from concurrent.futures import Future
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sb3_abisim.atomic import FolderLockedError, folder_lock, write_atomic
 from sb3_abisim.benchmark.cell import CellError, is_done
-from sb3_abisim.benchmark.engine import LocalEngine, make_engine, run_cells
+from sb3_abisim.benchmark.engine import LocalEngine, done_share, make_engine, run_cells
 from sb3_abisim.benchmark.graph import Cell
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -97,6 +98,21 @@ def test_a_cell_in_a_program_of_its_own(tmp_path: Path) -> None:
     log = (tmp_path / "logs" / f"{bad.name}.log").read_text()
     assert "$ python -m json.tool no_such_file bad.zip" in log
     assert list(errors) == ["bad"] and str(tmp_path / "logs" / f"{bad.name}.log") in errors["bad"]
+
+
+def test_the_share_that_is_done(tmp_path: Path) -> None:
+    encoder = Cell("encoder", "e", {}, (), (), "encoders/x.safetensors", units=200)
+    assert done_share(tmp_path, encoder) == 0
+    (tmp_path / "encoders" / "x.run").mkdir(parents=True)
+    (tmp_path / "encoders" / "x.run" / "progress.csv").write_text("train/loss,time/n_updates\n0.5,20\n0.4,50\n")
+    assert done_share(tmp_path, encoder) == 0.25
+    run = Cell("run", "r", {"env_id": "E"}, (), (), "runs/r", units=1000)
+    folder = tmp_path / "work" / run.name / "ppo" / "E_1"
+    folder.mkdir(parents=True)
+    (folder / "evaluations.npz").write_bytes(b"PK half written")
+    assert done_share(tmp_path, run) == 0
+    np.savez(folder / "evaluations.npz", timesteps=[100, 400])
+    assert done_share(tmp_path, run) == 0.4
 
 
 DRIVER = """

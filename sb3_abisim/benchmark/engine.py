@@ -1,6 +1,7 @@
 """Run the cells of a benchmark: what is missing, each as soon as its inputs are there, with one display over all."""
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from sb3_abisim.benchmark.graph import Cell
 REFRESH_SECONDS = 1.0
 # Before anything has been measured: seconds per transition, update, step and episode.
 _FIRST_GUESS = {"data": 2e-4, "encoder": 2e-2, "run": 1e-3, "final": 5e-2}
+_START_SECONDS = 5.0
 
 
 class Engine(Protocol):
@@ -153,21 +155,25 @@ class _Run:
             share = done_share(self.root, cell)
             if share > 0.02:
                 self.rates[_rate_name(cell)] = (now - start) / share / cell.units
+            else:
+                # It leaves no trace yet. One that takes longer than expected is never taken for done.
+                share = min(0.9, (now - start) / self._seconds(cell))
             left += self._seconds(cell) * (1 - share)
             spent += self._seconds(cell) * share
         left += sum(self._seconds(cell) for cell in self.waiting)
         spent += sum(self._seconds(cell) for cell in self.cells if cell.name in self.done)
         self.bar.n = spent / (spent + left) if spent + left else 1.0
         slots = max(1, min(self.engine.n_slots, len(self.running) + len(self.waiting)))
-        minutes = int(left / slots / 60 + 0.5)
-        clock = f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{minutes} min"
+        hours, minutes = divmod(math.ceil(left / slots / 60), 60)
+        clock = f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
         names = ", ".join(cell.title for cell, _ in list(self.running.values())[:2])
         state = f"{len(self.done)}/{len(self.cells)} cells, about {clock} left"
         more = f", +{len(self.running) - 2}" if len(self.running) > 2 else ""
         self.bar.set_description_str(f"{state}; {names}{more}" if names else state)
 
     def _seconds(self, cell: Cell) -> float:
-        return cell.units * self.rates.get(_rate_name(cell), _FIRST_GUESS[cell.kind])
+        rate = self.rates.get(_rate_name(cell))
+        return _START_SECONDS + cell.units * _FIRST_GUESS[cell.kind] if rate is None else cell.units * rate
 
 
 def _rate_name(cell: Cell) -> str:
