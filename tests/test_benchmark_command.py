@@ -1,0 +1,93 @@
+"""The command as a user types it."""
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sb3_abisim.benchmark.__main__ import main
+
+ROOT = Path(__file__).resolve().parent.parent
+SMALL = [
+    "--env", "Nav2D-v0", "--methods", "ssi", "--seeds", "0", "--n-transitions", "2000", "-n", "2000", "--eval-freq", "200",
+    "--eval-episodes", "2", "--n-eval-envs", "2", "--final-episodes", "5", "--device", "cpu", "--jobs", "1",
+    "--pretrain-params", "n_updates:20", "log_interval:10", "batch_size:64", "--params", "dqn.learning_starts:100",
+    "--no-report",
+]  # fmt: skip
+
+
+def test_dry_run_lists_the_cells_and_does_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["-o", str(tmp_path / "new"), *SMALL, "--dry-run"])
+    out = capsys.readouterr().out
+    assert [line.split()[1].split("-")[0] for line in out.splitlines()[::2]] == ["data", "encoder", "run", "final"]
+    assert all(line.startswith("missing") for line in out.splitlines()[::2])
+    assert "python -m sb3_abisim.pretrain --objective ssi --env Nav2D-v0" in out
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--methods", "abisym"], "unknown method 'abisym'"),
+        (["--jobs", "0"], "n_jobs must be at least 1, got 0"),
+        (["report", "nowhere"], "no run folders of rl-zoo3 below nowhere"),
+        (["evaluate", "nowhere"], "nowhere is no run folder of rl-zoo3"),
+    ],
+)
+def test_mistakes_end_with_2(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 2 and message in capsys.readouterr().err
+    assert not list(tmp_path.glob("**/logs")), "nothing was started"
+
+
+def test_what_the_report_needs_is_said_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rliable" else find_spec(name))
+    with pytest.raises(SystemExit):
+        main(["-o", str(tmp_path / "new")])
+    assert "rliable not installed; run: pip install 'sb3_abisim[benchmark]'" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.slow
+def test_a_kill_costs_the_cell_in_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [sys.executable, "-m", "sb3_abisim.benchmark", "-o", str(tmp_path), *SMALL]
+    driver = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    deadline = time.monotonic() + 300
+    while not list(tmp_path.glob("work/run-*/dqn/*/evaluations.npz")):
+        assert time.monotonic() < deadline and driver.poll() is None
+        time.sleep(0.1)
+    driver.send_signal(signal.SIGKILL)
+    driver.wait()
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").iterdir()}
+    assert sorted(path.name.split("-")[0] for path in kept) == ["data", "encoder"]
+    main(["-o", str(tmp_path), *SMALL])
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in kept.items()), "what was done stays done"
+    (log,) = (tmp_path / "logs").glob("run-*.log")
+    assert log.read_text().count("$ python -m sb3_abisim.zoo train") == 2
+    assert "4 of 4 cells done, 2 of them before; 0 failed" in capsys.readouterr().err
+    (run,) = (tmp_path / "runs").glob("Nav2D-v0/ssi-*/dqn/Nav2D-v0_*")
+    assert np.load(run / "evaluations.npz")["timesteps"].tolist() == list(range(200, 2001, 200))
+    final = np.load(run / "final_evaluations.npz")
+    assert set(final) == {
+        f"{mode}/standard/{name}" for mode in ("deterministic", "sampled")
+        for name in ("results", "ep_lengths", "successes")
+    }  # fmt: skip
+    assert all(final[name].shape == (5,) for name in final)
+    main(["evaluate", str(run), "--episodes", "5"])
+    repeated = np.load(run / "final_evaluations.npz")
+    assert all((repeated[name] == final[name]).all() for name in final), "every evaluation is the same"
+    main(["report", str(tmp_path), "--reference", "ssi"])
+    assert (tmp_path / "report" / "index.html").is_file()
