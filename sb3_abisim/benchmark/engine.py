@@ -230,7 +230,7 @@ def make_engine(name: str, n_jobs: int | None, threads: int, **ray_options: Any)
     :raises ValueError: for another name
     """
     if name == "local":
-        return LocalEngine(n_jobs or default_jobs(threads), threads)
+        return LocalEngine(default_jobs(threads) if n_jobs is None else n_jobs, threads)
     if name == "ray":
         from sb3_abisim.benchmark.ray_engine import RayEngine
 

@@ -49,7 +49,7 @@ class RayEngine:
         if room < 1:
             ray.shutdown()
             raise ValueError(f"the cluster has no room for a cell of {threads} processors and {gpus} GPUs: {resources}")
-        self.n_slots, self.threads = n_jobs or room, threads
+        self.n_slots, self.threads = room if n_jobs is None else n_jobs, threads
         self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": retries}
 
     def submit(self, root: Path, cell: "Cell") -> "Future[None]":
