@@ -16,9 +16,9 @@ from sb3_abisim.benchmark.__main__ import main
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = [
     "--env", "Nav2D-v0", "--methods", "ssi", "--seeds", "0", "--n-transitions", "2000", "-n", "2000",
-    "--eval-freq", "200", "--eval-episodes", "2", "--n-eval-envs", "2", "--final-episodes", "5", "--device", "cpu", "--jobs", "1",
+    "--eval-freq", "200", "--eval-episodes", "2", "--n-eval-envs", "2", "--final-episodes", "5",
+    "--device", "cpu", "--jobs", "1", "--no-report",
     "--pretrain-params", "n_updates:20", "log_interval:10", "batch_size:64", "--params", "dqn.learning_starts:100",
-    "--no-report",
 ]  # fmt: skip
 
 
