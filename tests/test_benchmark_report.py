@@ -1,6 +1,7 @@
 """The report, from run folders alone."""
 
 import csv
+import json
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -163,6 +164,13 @@ def test_labels(tmp_path: Path) -> None:
     assert sorted(run.label for run in find_runs(tmp_path)) == ["abisim", "abisim,frozen", "vanilla"]
     groups = compare([f"mine={tmp_path / 'ppo' / 'PointMaze-v0_1'}"], "evaluations", "mine", [0.5]).groups
     assert list(groups["PointMaze-v0"]) == ["mine"]
+
+
+def test_a_benchmarks_folder_is_read_by_its_index(tmp_path: Path) -> None:
+    paths = [write_run(tmp_path, "PointMaze-v0", "ssi", seed, STEPS, np.zeros((len(STEPS), 1))) for seed in range(3)]
+    entries = [{"folder": str(path.relative_to(tmp_path)), "label": f"ssi={i}"} for i, path in enumerate(paths[:2])]
+    (tmp_path / "benchmark.json").write_text(json.dumps({"runs": entries}))
+    assert [(run.label, run.seed) for run in find_runs(tmp_path)] == [("ssi=0", 0), ("ssi=1", 1)]
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:

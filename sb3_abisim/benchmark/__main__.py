@@ -11,7 +11,7 @@ from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark.cell import is_done
 from sb3_abisim.benchmark.engine import make_engine, run_cells
 from sb3_abisim.benchmark.evaluate import evaluate_final
-from sb3_abisim.benchmark.graph import Cell, Plan, build
+from sb3_abisim.benchmark.graph import Cell, Plan, build, run_label
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.zoo import EXTRACTORS
 
@@ -100,7 +100,8 @@ def _run(args: argparse.Namespace) -> None:
     root.mkdir(parents=True, exist_ok=True)
     engine = make_engine(args.engine, args.jobs, args.threads, **options)
     errors = run_cells(root, cells, engine)
-    index = {"plan": dataclasses.asdict(plan), "runs": [cell.output for cell in cells if cell.kind == "run"]}
+    runs = [{"folder": cell.output, "label": run_label(cell)} for cell in cells if cell.kind == "run"]
+    index = {"plan": dataclasses.asdict(plan), "runs": runs}
     write_atomic(root / INDEX_NAME, lambda file: file.write(json.dumps(index, indent=1).encode()))
     if errors:
         print(f"{len(errors)} cells failed: {', '.join(errors)}; their logs are in {root / 'logs'}", file=sys.stderr)

@@ -226,6 +226,16 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
     return Cell("run", title, settings, inputs, tuple(command), output, f"{env_id}.zip", n)
 
 
+def run_label(run: Cell) -> str:
+    """What a report calls a run: its method, and the encoder where one was given.
+
+    :param run: what :func:`run_cell` made
+    """
+    settings = run.settings
+    given = f"={settings['encoder_digest'][:6]}" if "encoder_digest" in settings else ""
+    return f"{settings['method']}{given}{',frozen' if settings['frozen'] else ''}"
+
+
 def final_cell(plan: Plan, run: Cell) -> Cell:
     """The evaluation of a run's final model: on each split of the distractors, where there are any."""
     splits = SPLITS if run.settings["env_id"] in DISTRACTOR_IDS else ()

@@ -149,13 +149,17 @@ def find_runs(folder: str | Path) -> list[Run]:
     folder = Path(folder)
     index = folder / "benchmark.json"
     if index.is_file():
-        paths = [folder / name for name in json.loads(index.read_bytes())["runs"]]
-        paths = [path for path in paths if path.is_dir()]
+        entries = json.loads(index.read_bytes())["runs"]
+        runs = [
+            dataclasses.replace(read_run(folder / entry["folder"]), label=entry["label"])
+            for entry in entries
+            if (folder / entry["folder"]).is_dir()
+        ]
     else:
-        paths = sorted(path.parent.parent for path in folder.glob("**/args.yml"))
-    if not paths:
+        runs = [read_run(path.parent.parent) for path in sorted(folder.glob("**/args.yml"))]
+    if not runs:
         raise ValueError(f"no run folders of rl-zoo3 below {folder}; train first, or give its log folder")
-    return [read_run(path) for path in paths]
+    return runs
 
 
 def is_deterministic(env_id: str) -> bool | None:
