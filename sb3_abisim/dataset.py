@@ -33,8 +33,8 @@ from sb3_abisim.dataset_format import (
 VERIFY_BELOW_BYTES = 4 * 10**9
 # Files whose hash this process has found right: (path, size, time of the last change, sha256).
 _VERIFIED: set[tuple[str, int, int, str]] = set()
-# Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbours along with it,
-# so that many times as much can be resident meanwhile. Pages stay in its cache: reading them again is cheap.
+# Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbours with it, so
+# that many times as much can be resident meanwhile. Pages stay in its cache: reading them again is cheap.
 RELEASE_AFTER_BYTES = 64 * 2**20
 # Which segments are held out is a property of the dataset, not of a run.
 _HOLDOUT_SEED = 20240229
