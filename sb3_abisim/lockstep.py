@@ -78,8 +78,7 @@ class _Row:
         generators = self._batch._generators
         if not generators:
             generators.extend(seeding.np_random(None)[0] for _ in range(self._batch.num_envs))
-        if options:
-            raise ValueError(f"{type(self._batch).__name__} knows no reset options, got {sorted(options)}")
+        self._batch._take_options(options or {})
         if seed is not None:
             generators[self._index] = seeding.np_random(seed)[0]
         self._batch._begin(self._indices)
@@ -103,8 +102,12 @@ class _Row:
         observations, rewards, terminated, truncated, infos = self._outcome
         self._outcome, row = None, self._row
         self._needs_reset = bool(terminated[self._index] or truncated[self._index])
-        info = {"is_success": infos["is_success"][row]}
-        return observations[row], rewards[row], terminated[row], truncated[row], info
+        info = {name: array[row] for name, array in infos.items()}
+        if isinstance(observations, dict):
+            observation: Any = {name: array[row] for name, array in observations.items()}
+        else:
+            observation = observations[row]
+        return observation, rewards[row], terminated[row], truncated[row], info
 
     def factors(self) -> dict[str, NDArray[Any]]:
         return {name: array[self._row] for name, array in self._batch.factors().items()}

@@ -11,6 +11,8 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
+from sb3_abisim.scan_networks import FEATURES_DIM, resnet18_layers, small_layers
+
 
 class Encoder(nn.Module):
     """A convolutional network from images to an embedding, rebuilt from :meth:`spec` alone.
@@ -120,7 +122,39 @@ class PointMazeEncoder(Encoder):
         super().__init__(layers, features_dim, {"n_input_channels": n_input_channels, "features_dim": features_dim})
 
 
-ENCODERS: dict[str, type[Encoder]] = {cls.__name__: cls for cls in (Nav2DEncoder, PointMazeEncoder)}
+class ScanNavEncoder(Encoder):
+    """128 x 128 RGB-D pictures to 2048 numbers: a small network for CPUs, ours.
+
+    :param n_input_channels: channels of the observation
+    """
+
+    observation_shape = (4, 128, 128)
+
+    def __init__(self, n_input_channels: int = 4) -> None:
+        super().__init__(small_layers(n_input_channels), FEATURES_DIM, {"n_input_channels": n_input_channels})
+
+
+class ScanNavResNet18(Encoder):
+    """RGB-D pictures to 2048 numbers: the visual encoder of Habitat's PointNav policy, which the paper uses.
+
+    :param n_input_channels: channels of the observation
+    :param image_size: its height and width, 64, 128 or 256
+    :raises ValueError: for another ``image_size``, at which there would not be 2048 numbers
+    """
+
+    observation_shape = (4, 256, 256)
+
+    def __init__(self, n_input_channels: int = 4, image_size: int = 256) -> None:
+        if image_size not in (64, 128, 256):
+            raise ValueError(f"image_size must be 64, 128 or 256, got {image_size!r}")
+        layers = resnet18_layers(n_input_channels, image_size)
+        super().__init__(layers, FEATURES_DIM, {"n_input_channels": n_input_channels, "image_size": image_size})
+        self.observation_shape = (n_input_channels, image_size, image_size)
+
+
+ENCODERS: dict[str, type[Encoder]] = {
+    cls.__name__: cls for cls in (Nav2DEncoder, PointMazeEncoder, ScanNavEncoder, ScanNavResNet18)
+}
 
 
 def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **kwargs: Any) -> Encoder:

@@ -12,7 +12,10 @@ def image_space(*shape):
     return gym.spaces.Box(0, 255, shape, np.uint8)
 
 
-@pytest.mark.parametrize(("shape", "features_dim"), [((3, 15, 15), 576), ((3, 64, 64), 32)])
+@pytest.mark.parametrize(
+    ("shape", "features_dim"),
+    [((3, 15, 15), 576), ((3, 64, 64), 32), ((4, 128, 128), 2048), ((4, 256, 256), 2048)],
+)
 def test_paper_sizes(shape, features_dim):
     encoder = make_encoder(image_space(*shape))
     assert encoder(th.rand(2, *shape)).shape == (2, features_dim) and encoder.features_dim == features_dim
@@ -27,6 +30,20 @@ def test_spec_rebuilds_the_network(name):
     again.load_state_dict(encoder.state_dict())
     x = th.rand(2, *shape)
     assert th.equal(encoder(x), again(x))
+
+
+@pytest.mark.parametrize("size", [64, 128, 256])
+def test_habitats_resnet(size):
+    """Sizes and numbers of weights of habitat-baselines' encoder."""
+    encoder = make_encoder(image_space(4, size, size), "ScanNavResNet18", image_size=size)
+    assert encoder(th.rand(1, 4, size, size)).shape == (1, 2048)
+    n_backbone = sum(p.numel() for p in encoder.layers[1].parameters())
+    assert n_backbone == 2_800_448
+    n_channels = {64: 2048, 128: 512, 256: 128}[size]
+    assert sum(p.numel() for p in encoder.parameters()) == n_backbone + n_channels * (256 * 9 + 2)
+    assert encoder.layers[1](th.rand(1, 4, size // 2, size // 2)).shape == (1, 256, size // 64, size // 64)
+    with pytest.raises(ValueError, match="image_size must be 64, 128 or 256, got 96"):
+        make_encoder(image_space(4, 96, 96), "ScanNavResNet18", image_size=96)
 
 
 def test_inputs_are_mapped_to_plus_minus_one():

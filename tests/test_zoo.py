@@ -42,7 +42,7 @@ def effective(manager: Any) -> dict[str, Any]:
     hyperparams, saved = manager.read_hyperparameters()
     rest = {key: saved[key] for key in ("n_envs", "n_timesteps", "monitor_kwargs", "callback") if key in saved}
     processed = dict(manager._preprocess_hyperparams(hyperparams)[0])
-    for key in ("learning_rate", "clip_range"):
+    for key in ("learning_rate", "clip_range", "clip_range_vf"):
         if key in processed:
             processed[key] = processed[key](0.5)
     return processed | rest | {"env_kwargs": manager.env_kwargs, "eval_env_kwargs": manager.eval_env_kwargs}
@@ -183,6 +183,9 @@ def test_every_entry_builds_its_model(manager: Any, tmp_path: Path, algo: str, e
 def test_shipped_encoders() -> None:
     """Needs the files under encoders/, which come from `python -m sb3_abisim.pretrain`."""
     for algo, env_id in ENTRIES:
+        # Encoders for scans are large and belong to one's own scans: none are shipped.
+        if env_id.startswith("ScanNav"):
+            continue
         text = yaml.safe_load((resource_path("hyperparams") / f"{algo}.yml").read_text())[env_id]["policy_kwargs"]
         folder = text.split("'encoder': '")[1].split("/")[0]
         for method in PRETRAINED:

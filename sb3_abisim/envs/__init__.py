@@ -15,6 +15,14 @@ _TABLE: dict[str, tuple[str, str, dict[str, object], int]] = {
     "ContinuousPointMaze-v0": ("point_maze", "PointMaze", {"continuous": True}, 128),
     "DistractorPointMaze-v0": ("distractors", "DistractorPointMaze", {}, 128),
     "ContinuousDistractorPointMaze-v0": ("distractors", "DistractorPointMaze", {"continuous": True}, 128),
+    "ScanNav-v0": ("scan_nav", "ScanNav", {}, 500),
+    # The paper's setting: Habitat's sensors and view, a plain box on the agent, detours preferred.
+    "ScanNavPaper-v0": (
+        "scan_nav",
+        "ScanNav",
+        {"image_size": 256, "view_size": 10.0, "marker": "box", "min_ratio": 1.1},
+        500,
+    ),
 }
 
 ENV_IDS = tuple(_TABLE)

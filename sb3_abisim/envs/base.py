@@ -79,13 +79,31 @@ class BatchEnv(gym.vector.VectorEnv):
         """Move every copy by one step.
 
         :param actions: valid actions, shape (num_envs, *action shape)
-        :return: rewards and whether the goal was reached (which ends the episode), each of shape (num_envs,)
+        :return: rewards and whether the episode has ended by itself, each of shape (num_envs,)
         """
         raise NotImplementedError
 
-    def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Observations of the copies ``indices`` in a new array, shape (len(indices), *observation shape)."""
+    def _observe(self, indices: NDArray[np.int64]) -> Any:
+        """Observations of the copies ``indices`` in a new array, shape (len(indices), *observation shape).
+
+        Where the observation space is a ``Dict``, a dictionary of such arrays.
+        """
         raise NotImplementedError
+
+    def _infos(self, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+        """What ``infos`` says about the step just taken, name to array (num_envs,); without more, the end is success.
+
+        :param ended: as returned by :meth:`_advance`
+        """
+        return {"is_success": ended.copy()}
+
+    def _take_options(self, options: dict[str, Any]) -> None:
+        """Note what the coming reset is asked for; it is called before each, mostly with no options.
+
+        :param options: of ``reset``
+        """
+        if options:
+            raise ValueError(f"{type(self).__name__} knows no reset options, got {sorted(options)}")
 
     def _render_frame(self, index: int) -> NDArray[np.uint8]:
         """A picture of one copy that a person can look at, shape (height, width, 3), RGB."""
@@ -102,14 +120,13 @@ class BatchEnv(gym.vector.VectorEnv):
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start a new episode in every copy.
 
         :param seed: copy i gets ``seed + i``, or ``seed[i]`` of a list; None goes on with the present generators
-        :param options: none are known
+        :param options: none are known, unless the environment says so
         """
-        if options:
-            raise ValueError(f"{type(self).__name__} knows no reset options, got {sorted(options)}")
+        self._take_options(options or {})
         seeds = list(seed) if isinstance(seed, (list, tuple)) else None
         if seeds is None:
             seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]  # type: ignore[arg-type]
@@ -131,7 +148,7 @@ class BatchEnv(gym.vector.VectorEnv):
 
     def step(
         self, actions: Any
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Take one action in every copy.
 
         :param actions: shape (num_envs, *action shape)
@@ -141,13 +158,15 @@ class BatchEnv(gym.vector.VectorEnv):
         actions = self._check_actions(actions)
         if self._needs_reset:
             raise RuntimeError("the episode is over (or has not begun): call reset() before step()")
-        rewards, reached = self._advance(actions)
+        rewards, ended = self._advance(actions)
         self._elapsed += 1
-        truncated, done = np.zeros(self.num_envs, dtype=bool), reached
+        truncated, done = np.zeros(self.num_envs, dtype=bool), ended
         if self.max_episode_steps is not None:
-            done = reached | (self._elapsed >= self.max_episode_steps)
-            truncated = done & ~reached
-        infos: dict[str, Any] = {"is_success": reached.copy(), "_is_success": self._always.copy()}
+            done = ended | (self._elapsed >= self.max_episode_steps)
+            truncated = done & ~ended
+        infos: dict[str, Any] = self._infos(ended)
+        for name in tuple(infos):
+            infos[f"_{name}"] = self._always.copy()
         observations = self._observe(self._everyone)
         # Counting is the fastest way to see whether there is any.
         if np.count_nonzero(done):
@@ -155,28 +174,29 @@ class BatchEnv(gym.vector.VectorEnv):
                 infos |= self._restart(np.flatnonzero(done), observations, infos)
             else:
                 self._needs_reset = True
-        return observations, rewards, reached, truncated, infos
+        return observations, rewards, ended, truncated, infos
 
-    def _restart(
-        self, ended: NDArray[np.int64], observations: NDArray[np.uint8], infos: dict[str, Any]
-    ) -> dict[str, Any]:
+    def _restart(self, ended: NDArray[np.int64], observations: Any, infos: dict[str, Any]) -> dict[str, Any]:
         """Begin new episodes in ``ended``, write their first frames into ``observations``, return the final infos."""
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[ended] = True
         final_obs = np.full(self.num_envs, None, dtype=object)
         for i in ended:
-            final_obs[i] = observations[i].copy()
+            final_obs[i] = one_of(observations, i, copy=True)
         final_factors = {
             name: np.where(_along(mask, array), array, np.zeros_like(array)) for name, array in self.factors().items()
         }
         self._begin(ended)
-        observations[ended] = self._observe(ended)
-        final_info = {
-            "is_success": infos["is_success"] & mask,
-            "_is_success": mask.copy(),
-            "factors": final_factors,
-            "_factors": mask.copy(),
-        }
+        first = self._observe(ended)
+        if isinstance(observations, dict):
+            for name, array in observations.items():
+                array[ended] = first[name]
+        else:
+            observations[ended] = first
+        final_info: dict[str, Any] = {}
+        for name, array in infos.items():
+            final_info[name] = mask.copy() if name[0] == "_" else np.where(mask, array, np.zeros_like(array))
+        final_info |= {"factors": final_factors, "_factors": mask.copy()}
         return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
 
     def _check_actions(self, actions: Any) -> NDArray[Any]:
@@ -205,8 +225,8 @@ class BatchEnv(gym.vector.VectorEnv):
 class SingleEnv(gym.Env):
     """A ``gymnasium.Env`` made of a :class:`BatchEnv` of one copy.
 
-    ``info["is_success"]`` is a bool at every step. Episodes have no time limit of their own: ``gymnasium.make`` adds
-    the registered one.
+    ``info["is_success"]`` is a bool at every step; what else the batch says about a step stands beside it. Episodes
+    have no time limit of their own: ``gymnasium.make`` adds the registered one.
 
     :param render_mode: None or "rgb_array"
     :param kwargs: passed to the batch class
@@ -221,29 +241,27 @@ class SingleEnv(gym.Env):
         self.observation_space = self.batch.single_observation_space
         self.action_space = self.batch.single_action_space
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start a new episode; ``seed`` determines it and all that follow.
 
         :param seed: None goes on with the present generator
-        :param options: none are known
+        :param options: none are known, unless the environment says so
         """
         super().reset(seed=seed)
         observations, _ = self.batch.reset(seed=seed, options=options)
         # One generator: a wrapper that draws from `env.np_random` advances the same stream as the environment.
         self._np_random = self.batch._generators[0]
-        return observations[0], {}
+        return one_of(observations, 0), {}
 
-    def step(self, action: Any) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take one action.
 
         :param action: an element of the action space
         :raises ValueError: for an action of the wrong shape, out of range, or not finite
         """
         observations, rewards, terminated, truncated, infos = self.batch.step(np.asarray(action)[None])
-        info = {"is_success": bool(infos["is_success"][0])}
-        return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
+        info = {name: array[0].item() for name, array in infos.items() if name[0] != "_"}
+        return one_of(observations, 0), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def factors(self) -> dict[str, NDArray[Any]]:
         """The simulator's state behind the current observation, for probes; see :meth:`BatchEnv.factors`."""
@@ -253,6 +271,18 @@ class SingleEnv(gym.Env):
         """A picture that a person can look at, (height, width, 3) uint8 RGB; None without ``render_mode``."""
         frames = self.batch.render()
         return None if frames is None else frames[0]
+
+
+def one_of(observations: Any, index: int, copy: bool = False) -> Any:
+    """One observation of a batch.
+
+    :param observations: an array, or a dictionary of arrays
+    :param index: which
+    :param copy: False gives a view
+    """
+    if isinstance(observations, dict):
+        return {name: one_of(array, index, copy) for name, array in observations.items()}
+    return observations[index].copy() if copy else observations[index]
 
 
 def _bounds(space: gym.Space[Any]) -> tuple[Any, Any]:

@@ -1,0 +1,284 @@
+"""Scan files as triangles with colours: everything that can be wrong with a file is found here.
+
+A :class:`ScanMesh` is z-up, in metres. Files are read by trimesh (``pip install 'sb3_abisim[scan]'``).
+"""
+
+import io
+import json
+import os
+import struct
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.atomic import file_digest
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
+UP_AXES = ("auto", "y", "z")
+MISSING_COLOUR = (160, 160, 160)
+# Heights are counted in bins of this many metres.
+LEVEL_BIN = 0.05
+MIN_LEVEL_AREA = 1.5  # m2
+MIN_UP_RATIO = 1.25
+# A face is level where its unit normal's vertical part is above this.
+_LEVEL_NORMAL = 0.9
+_EXTENT = (1.0, 200.0)  # m
+_UNSUPPORTED = {
+    "KHR_draco_mesh_compression": "Draco compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
+    "EXT_meshopt_compression": "meshopt compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
+    "KHR_texture_basisu": "KTX2 textures (convert them: `npx @gltf-transform/cli ktxdecompress IN OUT`)",
+}
+
+
+class SceneError(ValueError):
+    """A scan that cannot be used; the message names the file and the remedy."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A run of faces that share one kind of colouring.
+
+    :param n_faces: their number
+    :param texture: uint8 (height, width, 3), or None
+    :param coordinates: with a texture, (n_faces, 3, 2) of its u to the right and v upwards, 1 being its whole size, for
+        the three corners of each face; without one, their colours (n_faces, 3, 3) in 0..255
+    """
+
+    n_faces: int
+    texture: NDArray[np.uint8] | None
+    coordinates: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ScanMesh:
+    """Triangles with colours, z up, in metres.
+
+    :param vertices: float64 (n, 3)
+    :param faces: int64 (m, 3), counter-clockwise seen from outside
+    :param surfaces: how the faces are coloured, in their order
+    :param files: what was read: path relative to the scan's folder, to its sha256, or to "" for a missing file
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    surfaces: tuple[Surface, ...]
+    files: dict[str, str]
+
+    def corners(self) -> NDArray[np.float64]:
+        """The corners of each face, shape (m, 3, 3)."""
+        return self.vertices[self.faces]
+
+
+def load_mesh(path: str | os.PathLike[str], up: str = "auto") -> ScanMesh:
+    """Read a scan.
+
+    :param path: a .glb, .gltf, .obj or .ply file with textures or vertex colours
+    :param up: the file's upward axis, "y" or "z"; "auto" takes the one with the larger horizontal floor
+    :raises SceneError: for whatever is wrong with the file
+    :raises ImportError: without trimesh
+    """
+    path = Path(path)
+    if up not in UP_AXES:
+        raise ValueError(f"up must be one of {UP_AXES}, got {up!r}")
+    _check_file(path)
+    parts, files = _read(path)
+    vertices, faces, surfaces = [], [], []
+    n_vertices = 0
+    for part_vertices, part_faces, surface in parts:
+        vertices.append(part_vertices)
+        faces.append(part_faces + n_vertices)
+        surfaces.append(surface)
+        n_vertices += len(part_vertices)
+    mesh = ScanMesh(np.concatenate(vertices), np.concatenate(faces), tuple(surfaces), files)
+    if not np.isfinite(mesh.vertices).all():
+        raise SceneError(f"{path} has vertices that are not finite; export it again from its source")
+    extent = np.ptp(mesh.vertices, axis=0).max()
+    if not _EXTENT[0] <= extent <= _EXTENT[1]:
+        raise SceneError(
+            f"{path} is {extent:.3g} m wide, not between {_EXTENT[0]:g} and {_EXTENT[1]:g} m; its units are probably "
+            "not metres: rescale it"
+        )
+    return _turn_upright(path, mesh, up)
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what can be told to be wrong without reading all of it."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise SceneError(f"{path} is no scan file: its suffix must be one of {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise SceneError(f"there is no scan file {path}; check the path")
+    with open(path, "rb") as file:
+        head = file.read(64)
+    if not head:
+        raise SceneError(f"{path} is empty; download or copy it again")
+    if head.startswith(b"version https://git-lfs"):
+        raise SceneError(f"{path} is a Git LFS pointer, not the scan itself; run `git lfs pull` in its repository")
+    if path.suffix.lower() == ".glb":
+        _check_extensions(path, _glb_header(path, head))
+    elif path.suffix.lower() == ".gltf":
+        try:
+            _check_extensions(path, json.loads(path.read_bytes()))
+        except ValueError as error:
+            if isinstance(error, SceneError):
+                raise
+            raise SceneError(f"{path} cannot be read ({error}); download or export it again") from error
+
+
+def _glb_header(path: Path, head: bytes) -> dict[str, Any]:
+    if len(head) < 20 or head[:4] != b"glTF":
+        raise SceneError(f"{path} is not a binary glTF file; download it again, or give it the suffix of its format")
+    total, n_json = struct.unpack("<I", head[8:12])[0], struct.unpack("<I", head[12:16])[0]
+    if path.stat().st_size < total:
+        raise SceneError(f"{path} is truncated: it has {path.stat().st_size} of {total} bytes; download it again")
+    with open(path, "rb") as file:
+        file.seek(20)
+        try:
+            header: dict[str, Any] = json.loads(file.read(n_json))
+        except ValueError as error:
+            raise SceneError(f"{path} cannot be read ({error}); download or export it again") from error
+    return header
+
+
+def _check_extensions(path: Path, header: dict[str, Any]) -> None:
+    for name in header.get("extensionsRequired", []):
+        if name in _UNSUPPORTED:
+            raise SceneError(f"{path} uses {_UNSUPPORTED[name]}, which is not supported")
+
+
+_Part = tuple[NDArray[np.float64], NDArray[np.int64], Surface]
+
+
+def _read(path: Path) -> tuple[list[_Part], dict[str, str]]:
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ImportError("reading scans needs trimesh: pip install 'sb3_abisim[scan]'") from error
+
+    files = {path.name: file_digest(path)}
+    missing: list[str] = []
+
+    class Recorder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc, unused-ignore]
+        def get(self, name: str) -> bytes:
+            try:
+                data: bytes = super().get(name)
+            except (OSError, ValueError):
+                files[name] = ""
+                missing.append(name)
+                raise
+            file = self.absolute(name)
+            files[name] = file_digest(file) if file.is_file() else ""
+            return data
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            data = io.BytesIO(path.read_bytes())
+            scene = trimesh.load_scene(
+                data, file_type=path.suffix[1:].lower(), resolver=Recorder(str(path)), process=False
+            )
+            parts = _parts(scene, trimesh, missing)
+    except Exception as error:  # what trimesh raises for a damaged file depends on where the damage is
+        lost = f"; it refers to {missing[0]}, which is not there" if missing else ""
+        raise SceneError(f"{path} cannot be read ({type(error).__name__}: {error}){lost}; export it again") from error
+    if missing:
+        warnings.warn(
+            f"{path} refers to {', '.join(sorted(set(missing)))}, which is not there; its surfaces get a flat colour",
+            stacklevel=4,
+        )
+    if not parts:
+        kind = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
+        raise SceneError(f"{path} is {kind}: it has no faces; export the scan as a mesh of triangles")
+    return parts, files
+
+
+def _parts(scene: Any, trimesh: Any, missing: list[str]) -> list[_Part]:
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if not isinstance(geometry, trimesh.Trimesh) or not len(geometry.faces):
+            continue
+        vertices = trimesh.transform_points(geometry.vertices, transform)
+        faces = np.asarray(geometry.faces, dtype=np.int64)
+        # A mirrored part would be seen from the inside.
+        if np.linalg.det(transform[:3, :3]) < 0:
+            faces = faces[:, ::-1]
+        parts.append((np.asarray(vertices, dtype=np.float64), faces, _surface(geometry.visual, faces, missing)))
+    return parts
+
+
+def _surface(visual: Any, faces: NDArray[np.int64], missing: list[str]) -> Surface:
+    if visual.kind == "texture":
+        image, factor = _material(visual.material)
+        if image is not None and visual.uv is not None:
+            pixels = np.asarray(image.convert("RGB"), dtype=np.float32) * (factor / 255)
+            texture = np.rint(pixels).astype(np.uint8)
+            return Surface(len(faces), texture, np.asarray(visual.uv, dtype=np.float32)[faces])
+        # An untextured material has its own colour, unless it has lost its texture.
+        flat = np.array(MISSING_COLOUR if missing else factor, dtype=np.float32)
+        return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
+    if visual.kind == "vertex":
+        return Surface(len(faces), None, np.asarray(visual.vertex_colors, dtype=np.float32)[faces][..., :3])
+    if visual.kind == "face":
+        colours = np.asarray(visual.face_colors, dtype=np.float32)[:, None, :3]
+        return Surface(len(faces), None, np.broadcast_to(colours, (len(faces), 3, 3)))
+    flat = np.array(MISSING_COLOUR, dtype=np.float32)
+    return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
+
+
+def _material(material: Any) -> tuple[Any, NDArray[np.float32]]:
+    """Image and base colour (0..255, as shown on a screen) of a glTF or OBJ material."""
+    if hasattr(material, "baseColorFactor"):
+        factor, image = material.baseColorFactor, material.baseColorTexture
+        if factor is None:
+            return image, np.full(3, 255, dtype=np.float32)
+        linear = np.asarray(factor, dtype=np.float32)[:3] / 255
+        # glTF's factors are linear light.
+        return image, (255 * np.clip(linear, 0, 1) ** (1 / 2.2)).astype(np.float32)
+    image = material.image
+    diffuse = getattr(material, "diffuse", None)
+    # Many OBJ exporters write a grey or black Kd beside the texture and mean the texture alone.
+    if image is not None or diffuse is None:
+        return image, np.full(3, 255, dtype=np.float32)
+    return None, np.asarray(diffuse, dtype=np.float32)[:3]
+
+
+def level_areas(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How much level, up-facing area there is at which height.
+
+    :param corners: of the faces, (m, 3, 3), z up
+    :return: the bins' middle heights in m, and areas in m2 of each bin together with its two neighbours
+    """
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    level = normals[:, 2] > _LEVEL_NORMAL * length
+    heights = corners[level, :, 2].mean(axis=1)
+    if not len(heights):
+        return np.zeros(1), np.zeros(1)
+    bins = np.floor(heights / LEVEL_BIN).astype(np.int64)
+    first = bins.min() - 1
+    areas = np.bincount(bins - first, normals[level, 2] / 2, minlength=bins.max() - first + 2)
+    return (np.arange(len(areas)) + first + 0.5) * LEVEL_BIN, np.convolve(areas, np.ones(3), mode="same")
+
+
+def _turn_upright(path: Path, mesh: ScanMesh, up: str) -> ScanMesh:
+    turned = {"z": mesh.vertices, "y": mesh.vertices[:, [0, 2, 1]] * (1, -1, 1)}
+    if up == "auto":
+        areas = {axis: level_areas(vertices[mesh.faces])[1].max() for axis, vertices in turned.items()}
+        up, other = sorted(areas, key=lambda axis: -areas[axis])
+        if areas[up] >= MIN_LEVEL_AREA and areas[up] < MIN_UP_RATIO * areas[other]:
+            raise SceneError(
+                f"{path} could stand on either side: level areas of {areas['y']:.1f} m2 with y up and "
+                f"{areas['z']:.1f} m2 with z up; give up='y' or up='z'"
+            )
+    area = level_areas(turned[up][mesh.faces])[1].max()
+    if area < MIN_LEVEL_AREA:
+        raise SceneError(
+            f"{path} has no floor: its largest horizontal level has {area:.2f} m2 with {up} up, less than "
+            f"{MIN_LEVEL_AREA} m2; turn it so that gravity points along an axis, and check its units (metres)"
+        )
+    return ScanMesh(turned[up], mesh.faces, mesh.surfaces, mesh.files)
