@@ -90,7 +90,11 @@ def record_gif(run: Path, path: Path) -> float:
     import gymnasium as gym
     from stable_baselines3 import PPO
 
-    model = PPO.load(run / f"{ENV_ID}.zip", device="cpu")
+    from sb3_abisim.checkpoint import RUN_COPY
+    from sb3_abisim.frozen import fuse
+
+    # The run was trained on embeddings; fused with its encoder, the model acts on pictures.
+    model = fuse(PPO.load(run / f"{ENV_ID}.zip", device="cpu"), str(run / ENV_ID / RUN_COPY))
     env = gym.make(ENV_ID, split="eval", render_mode="rgb_array")
     frames, successes = [], 0
     for episode in range(GIF_EPISODES):
