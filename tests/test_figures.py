@@ -78,7 +78,6 @@ def test_sweep_pretrains_what_is_missing_once(tmp_path):
         (["perturbation", "PointMaze-v0/ssi"], "observation"),
         (["perturbation", "-n", "0"], "at least 1, got 0"),
         (["near-far", "--env", "PointMaze-v0"], "invalid choice"),
-        (["neighbours", "--env", "ContinuousDistractorPointMaze-v0"], "no encoder ships"),
         (["sweep", "-c", "0.1"], "give --data DIR"),
         (["curves", "no/such"], "no/such"),
     ],
@@ -87,6 +86,11 @@ def test_refuses(words, message, tmp_path, capsys):
     with pytest.raises(SystemExit):
         analyze.main([*words, "--images", str(tmp_path), "--trained", str(tmp_path)])
     assert re.search(message, capsys.readouterr().err)
+
+
+def test_environment_without_shipped_encoders():
+    with pytest.raises(ValueError, match="no encoder ships for ScanNav-v0"):
+        default_encoders("ScanNav-v0")
 
 
 def test_own_folder_joins_the_shipped_ones(tmp_path):
