@@ -7,6 +7,8 @@ import pytest
 import trimesh
 from PIL import Image
 
+from sb3_abisim.envs.scan_map import ScanMap
+
 # Inner size of the house, z up: x from 0 to 5, y from 0 to 4. A wall 10 cm thick at x = 2.5 with a door in the north.
 WALLS = [(-0.2, -0.2, 0, 4.2), (5, -0.2, 5.2, 4.2), (0, -0.2, 5, 0), (0, 4, 5, 4.2), (2.45, 0, 2.55, 2.6)]
 TABLE = (0.8, 0.6, 1.6, 1.2)
@@ -76,3 +78,13 @@ def write(scene, path: Path):
 def own_cache(tmp_path_factory, monkeypatch):
     """Import it where a test must not see maps of earlier runs."""
     monkeypatch.setenv("SB3_ABISIM_CACHE", str(tmp_path_factory.mktemp("scans")))
+
+
+def empty_room(width=8.0, depth=6.0, walls=()):
+    """A map by hand: 5 cm pixels, walkable but for ``walls`` (slices of rows and columns)."""
+    shape = round(depth / 0.05), round(width / 0.05)
+    walkable = np.ones(shape, dtype=bool)
+    for wall in walls:
+        walkable[wall] = False
+    colours = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
+    return ScanMap(colours, np.where(walkable, 0, 1).astype(np.float32), walkable, 0.05, (0.0, depth), "room")

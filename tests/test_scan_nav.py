@@ -6,26 +6,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import trimesh
+from scan_inputs import empty_room
 from scipy import ndimage
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 
 from sb3_abisim.envs.scan_apartment import SEEDS, apartment_mesh
-from sb3_abisim.envs.scan_map import ScanMap
-from sb3_abisim.envs.scan_mesh import SceneError
 from sb3_abisim.envs.scan_nav import ScanNavEnv, ScanNavVectorEnv, load_scene
 from sb3_abisim.envs.scan_view import MARKERS, area_means
 from sb3_abisim.envs.scan_world import NODE, DistanceGrid, StartRule
-
-
-def empty_room(width=8.0, depth=6.0, walls=()):
-    """A map by hand: 5 cm pixels, walkable but for ``walls`` (slices of rows and columns)."""
-    shape = round(depth / 0.05), round(width / 0.05)
-    walkable = np.ones(shape, dtype=bool)
-    for wall in walls:
-        walkable[wall] = False
-    colours = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
-    return ScanMap(colours, np.where(walkable, 0, 1).astype(np.float32), walkable, 0.05, (0.0, depth), "room")
 
 
 @pytest.fixture(scope="module")
@@ -324,63 +313,6 @@ def test_final_info_has_the_metrics(room):
     assert infos["_final_obs"].tolist() == [True, False, True]
     assert infos["final_info"]["spl"].tolist() == [1.0, 0.0, 1.0] and infos["final_info"]["success"][0] == 1
     assert np.abs(infos["final_info"]["factors"]["agent"][0] - (4.0, 2.9)).max() < 1e-9
-
-
-# Mistakes.
-
-
-def test_refuses_scenes_without_episodes():
-    with pytest.raises(SceneError, match=r"room: none of 300 goals .* lower min_geodesic, raise view_size"):
-        ScanNavEnv(scenes=empty_room(), min_geodesic=8.0)
-    with pytest.raises(SceneError, match="there is no scan file"):
-        ScanNavEnv(scenes="nowhere.glb")
-    with pytest.raises(SceneError, match="there is no scan map"):
-        ScanNavEnv(scenes=["nowhere.npz"])
-
-
-@pytest.mark.parametrize(
-    "kwargs",
-    [
-        {"obs_mode": "depth"},
-        {"marker": "disc"},
-        {"stop": "never"},
-        {"image_size": 127},
-        {"image_size": 8},
-        {"view_size": 0.5},
-        {"turn_angle": 0},
-        {"success_distance": -1},
-        {"max_geodesic": 0.5},
-        {"min_ratio": 0.5},
-        {"goals_per_scene": 0},
-        {"scenes": []},
-        {"scenes": 1.5},
-        {"scenes": -1},
-    ],
-    ids=str,
-)
-def test_refuses_settings(room, kwargs):
-    name, value = next(iter(kwargs.items()))
-    with pytest.raises(ValueError, match=f"{name.rstrip('s')}|seed") as error:
-        ScanNavEnv(**({"scenes": room} | kwargs))
-    assert str(value) in str(error.value) or value == []
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"gaol": 1}, "unknown reset options.*gaol"),
-        ({"start": (1, 1)}, "needs a goal"),
-        ({"scene": 1}, "index of 1 scenes, got 1"),
-        ({"goal": 3}, r"must be \(x, y\)"),
-        ({"goal": (90.0, 1.0)}, "not on the walkable floor"),
-        ({"goal": (4.0, 3.0), "start": (0.2, 3.0)}, "no way from the start"),
-        ({"heading": np.nan}, "heading"),
-    ],
-    ids=str,
-)
-def test_refuses_reset_options(room, options, message):
-    with pytest.raises(ValueError, match=message):
-        ScanNavEnv(scenes=room).reset(seed=0, options=options)
 
 
 def test_scenes_of_every_kind(room, tmp_path):
