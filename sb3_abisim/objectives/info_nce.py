@@ -13,7 +13,7 @@ Choices: the paper's equation is the likelihood itself and says "d is the l2 dis
 push each transition away from its action, so the loss here is the negative logarithm, and d minus the distance.
 
 The pair is written [psi(s), psi(s') - psi(s)], not [psi(s), psi(s')]: an embedded action can be near to the change
-that it makes, but not near to all states that it was taken in. With the plain pair, Nav2D stayed at chance.
+that it makes, but not near to all states that it was taken in. In a trial with the plain pair Nav2D stayed at chance.
 
 With discrete actions and k = 1 the negatives are all other actions. Otherwise they are the actions, or sequences of k
 actions, of the batch's other transitions, unless they equal the positive.
