@@ -9,7 +9,6 @@ the one least disturbed by other load on the machine. MuJoCo's renderer needs ``
 import argparse
 import heapq
 import os
-import platform
 import sys
 import time
 import warnings
@@ -19,6 +18,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+
+from benchmarks.tables import machine, use_one_core, write_page
 
 RESULTS = Path(__file__).parent / "results" / "envs.md"
 PLAIN_MAZE = "gymnasium-robotics PointMaze_UMaze-v3, rendered by MuJoCo"
@@ -194,29 +195,16 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     # Read by MuJoCo and OpenMP when they are imported.
     os.environ["MUJOCO_GL"] = args.gl
-    os.environ["OMP_NUM_THREADS"] = "1"
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    use_one_core()
     warnings.simplefilter("ignore")
     _require_renderer(args.gl)
     rows = measure(args.rounds, args.seconds)
-    text = "\n".join(
-        [
-            "# Speed of the environments",
-            "",
-            f"`make bench` on one core of {platform.machine()}, Python {platform.python_version()}: the fastest of "
-            f"{args.rounds} turns of {args.seconds} s. The ratio is to the plain implementation of the same kind "
-            f"(MuJoCo's renderer: {args.gl}, on the CPU).",
-            "",
-            "| environment | copies | steps/s | ratio | at least |",
-            "|---|---:|---:|---:|---:|",
-            *rows,
-            "",
-        ]
+    text = (
+        f"`make bench` on {machine()}: the fastest of {args.rounds} turns of {args.seconds} s. The ratio is to the "
+        f"plain implementation of the same kind (MuJoCo's renderer: {args.gl}, on the CPU)."
     )
-    print(text)
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    args.output.write_text(text)
+    header = ["| environment | copies | steps/s | ratio | at least |", "|---|---:|---:|---:|---:|"]
+    write_page(args.output, "Speed of the environments", text, header, rows)
     cells = [[cell.strip() for cell in row.split("|")] for row in rows]
     missed = [row[1] for row in cells if row[5] and float(row[4]) < float(row[5])]
     if missed:

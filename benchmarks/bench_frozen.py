@@ -6,12 +6,12 @@ disturbs less than the clock; the speed of each is that of its fastest turn. ``m
 """
 
 import argparse
-import os
-import platform
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from benchmarks.tables import machine, use_one_core, write_page
 
 RESULTS = Path(__file__).parent / "results" / "frozen.md"
 AIM = 5.0
@@ -75,9 +75,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="Markdown file (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each contender (default: %(default)s)")
     args = parser.parse_args(argv)
-    os.environ["OMP_NUM_THREADS"] = "1"
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    use_one_core()
     rows = []
     for algo, n_steps, title in (
         ("ppo", 16 * N_STEPS, "PPO, DistractorPointMaze-v0"),
@@ -93,21 +91,15 @@ def main(argv: list[str] | None = None) -> None:
         )
         print(row, flush=True)
         rows.append(row)
-    text = "\n".join(
-        [
-            "# Speed of RL on a frozen encoder",
-            "",
-            f"`python -m benchmarks.bench_frozen` on one core of {platform.machine()}, Python "
-            f"{platform.python_version()}: steps per second of processor time, fastest of {args.rounds} turns.",
-            "",
-            "| algorithm, environment | through the pixels | `VecEncodeObservations` | ratio | aim |",
-            "|---|---:|---:|---:|---:|",
-            *rows,
-            "",
-        ]
+    text = (
+        f"`python -m benchmarks.bench_frozen` on {machine()}: steps per second of processor time, fastest of "
+        f"{args.rounds} turns."
     )
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    args.output.write_text(text)
+    header = [
+        "| algorithm, environment | through the pixels | `VecEncodeObservations` | ratio | aim |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    write_page(args.output, "Speed of RL on a frozen encoder", text, header, rows)
 
 
 if __name__ == "__main__":

@@ -6,13 +6,13 @@ within one process, on one core, and the speed of each is that of its fastest tu
 """
 
 import argparse
-import os
-import platform
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+from benchmarks.tables import machine, use_one_core, write_page
 
 RESULTS = Path(__file__).parent / "results" / "pretrain.md"
 AIM = 3.0
@@ -150,9 +150,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=8, help="turns of each loop (default: %(default)s)")
     parser.add_argument("--updates", type=int, default=6, help="updates per turn (default: %(default)s)")
     args = parser.parse_args(argv)
-    os.environ["OMP_NUM_THREADS"] = "1"
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    use_one_core()
     from sb3_abisim.collect import collect
 
     rows, notes = [], []
@@ -173,26 +171,16 @@ def main(argv: list[str] | None = None) -> None:
                 rows.append(f"| {label} | {plain:,.0f} | {fast:,.0f} | {ratio:.1f} | {AIM:.0f} | {flops:.0f} |")
                 notes.append(f"* {label}: {parts}")
                 print(rows[-1], notes[-1], flush=True)
-    text = "\n".join(
-        [
-            "# Speed of pretraining",
-            "",
-            f"`python -m benchmarks.bench_pretrain` on one core of {platform.machine()}, batches of {BATCH_SIZE}: "
-            f"transitions per second in the fastest of {args.rounds} turns of {args.updates} updates. A product of two "
-            f"1024 x 1024 matrices reaches {matmul_rate():.0f} GFLOP/s on this core.",
-            "",
-            "| objective, environment | straightforward | ours | ratio | aim | ours, GFLOP/s |",
-            "|---|---:|---:|---:|---:|---:|",
-            *rows,
-            "",
-            "Where our time goes:",
-            "",
-            *notes,
-            "",
-        ]
+    text = (
+        f"`python -m benchmarks.bench_pretrain` on {machine()}, batches of {BATCH_SIZE}: transitions per second in the "
+        f"fastest of {args.rounds} turns of {args.updates} updates. A product of two 1024 x 1024 matrices reaches "
+        f"{matmul_rate():.0f} GFLOP/s on this core."
     )
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    args.output.write_text(text)
+    header = [
+        "| objective, environment | straightforward | ours | ratio | aim | ours, GFLOP/s |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    write_page(args.output, "Speed of pretraining", text, header, rows, ("Where our time goes:", "", *notes, ""))
 
 
 if __name__ == "__main__":

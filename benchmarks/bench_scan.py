@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.tables import machine, use_one_core, write_page
+
 RESULTS = Path(__file__).parent / "results" / "scan.json"
 # (copies, actions): least steps/s; the bound holds for walking, where no time goes into goals seen for the first time.
 TARGETS = {(1, "walking"): 0, (6, "walking"): 8000, (64, "walking"): 8000, (64, "random"): 0}
@@ -85,9 +87,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="JSON file (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each (default: %(default)s)")
     args = parser.parse_args(argv)
-    os.environ["OMP_NUM_THREADS"] = "1"
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    use_one_core()
     made = preprocessing()
     speeds = {key: stepping(*key, rounds=args.rounds, calls=max(20, 2000 // key[0])) for key in TARGETS}
     result = {
@@ -99,25 +99,17 @@ def main(argv: list[str] | None = None) -> None:
     args.output.parent.mkdir(parents=True, exist_ok=True)
     args.output.write_text(json.dumps(result, indent=1) + "\n")
     rows = [f"| {a} | {n} | {s:,.0f} | {TARGETS[n, a] or '':} |" for (n, a), s in speeds.items()]
-    text = "\n".join(
-        [
-            "# Speed of ScanNav",
-            "",
-            f"`python -m benchmarks.bench_scan` on one core of {platform.machine()}, Python "
-            f"{platform.python_version()}; CPU seconds. 128 x 128 RGB-D, five flats. Walking: random moves "
-            "without stop; random: with stop, so that episodes last four steps and most of the time goes into resets.",
-            "",
-            "| actions | copies | steps/s | at least |",
-            "|---|---:|---:|---:|",
-            *rows,
-            "",
-            f"A map of {made['triangles']:,} triangles takes {made['seconds']:.1f} s (at most {LONGEST:g}) and "
-            f"{made['peak_mb']:.0f} MB (at most {LARGEST:g}); read from the cache, {made['cached_seconds']:.2f} s.",
-            "",
-        ]
+    text = (
+        f"`python -m benchmarks.bench_scan` on {machine()}; CPU seconds. 128 x 128 RGB-D, five flats. Walking: random "
+        "moves without stop; random: with stop, so that episodes last four steps and most of the time goes into resets."
     )
-    print(text)
-    args.output.with_suffix(".md").write_text(text)
+    tail = (
+        f"A map of {made['triangles']:,} triangles takes {made['seconds']:.1f} s (at most {LONGEST:g}) and "
+        f"{made['peak_mb']:.0f} MB (at most {LARGEST:g}); read from the cache, {made['cached_seconds']:.2f} s.",
+        "",
+    )
+    header = ["| actions | copies | steps/s | at least |", "|---|---:|---:|---:|"]
+    write_page(args.output.with_suffix(".md"), "Speed of ScanNav", text, header, rows, tail)
     missed = [str(key) for key, speed in speeds.items() if speed < TARGETS[key]]
     missed += ["preprocessing"] if made["seconds"] > LONGEST or made["peak_mb"] > LARGEST else []
     if missed:

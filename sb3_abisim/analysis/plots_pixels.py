@@ -127,7 +127,9 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
         axis.grid(axis="y", alpha=0.3)
     axes[0, 0].set_ylabel("score (R², AUC, accuracy)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(handles), 7), fontsize=7)
+    # As many as fit on a line: the figure grows with its panels.
+    ncols = 7 * axes.shape[1] // 2
+    figure.legend(handles, labels, loc="outside lower center", ncols=ncols, fontsize=7)
     figure.suptitle(f"What probes read from the embedding, {results['env_id']}", fontsize=10)
     save(figure, path)
 
