@@ -36,7 +36,7 @@ def make(**kwargs):
 @pytest.mark.parametrize("split", ["train", "eval"])
 def test_foreground_is_byte_equal_to_the_clean_picture_and_the_rest_to_the_clip(split):
     # The clean copies see the same mazes and the same pushes, over several episodes.
-    clean, shown = make(split="clean"), make(split=split)
+    clean, shown = make(split="clean"), make(split=split, recolour=False)
     frames = [clip.load() for clip in load_backgrounds(split=split).clips]
     clean.reset(seed=7), shown.reset(seed=7)
     for actions in PUSHES:
@@ -48,6 +48,28 @@ def test_foreground_is_byte_equal_to_the_clean_picture_and_the_rest_to_the_clip(
         assert np.array_equal(picture, np.where(masks[:, None], plain, behind))
         floor = np.array([226, 226, 220])[:, None, None]
         assert (plain == floor).all(axis=1)[~masks].all()  # nothing of the foreground outside of the mask
+
+
+def test_training_shows_each_episode_in_a_look_of_its_own():
+    clean, shown = make(split="clean"), make()
+    frames = [clip.load() for clip in load_backgrounds().clips]
+    clean.reset(seed=7), shown.reset(seed=7)
+    seen = set()
+    for step, actions in enumerate(PUSHES):
+        plain, picture = clean.step(actions)[0], shown.step(actions)[0]
+        factors, looks = shown.factors(), shown._player._looks
+        behind = np.stack([frames[c][f] for c, f in zip(factors["clip"], factors["frame"], strict=True)])
+        floor = looks.apply(behind, np.arange(3))
+        assert np.array_equal(picture, np.where(foreground(clean)[:, None], plain, floor))
+        assert not np.array_equal(floor, behind)
+        if step == 3:
+            first = looks._channels.tobytes() + looks._first.tobytes() + looks._flips.tobytes()
+        if 3 <= step < 14:  # within the first episode
+            assert looks._channels.tobytes() + looks._first.tobytes() + looks._flips.tobytes() == first
+        seen |= {row.tobytes() for row in np.concatenate([looks._channels, looks._flips, looks._first[..., 0, 0]], 1)}
+    assert len(seen) >= 6
+    assert len({env.fingerprint for env in (shown, make(recolour=False), make(split="eval"), clean)}) == 4
+    assert make(split="eval").fingerprint == make(split="eval", recolour=False).fingerprint
 
 
 def test_clean_has_the_pictures_of_point_maze_in_the_first_episode():
@@ -102,7 +124,7 @@ def test_a_single_environment_is_a_batch_of_one(order):
 
 def test_shuffled_frames_are_less_alike():
     def similarity(order):
-        pictures, _ = rollout(make(order=order, clips=["fig"]), steps=14)
+        pictures, _ = rollout(make(order=order, clips=["fig"], recolour=False), steps=14)
         return np.abs(np.diff(pictures.astype(int), axis=0)).mean()
 
     assert similarity("shuffled") > 3 * similarity("video")
@@ -134,7 +156,7 @@ def test_registered_ids(env_id):
     env = gym.make_vec(env_id, num_envs=2, vectorization_mode="vector_entry_point")
     observations, _ = env.reset(seed=0)
     assert env.observation_space.contains(observations) and env.spec.max_episode_steps == 128
-    assert gym.make(env_id).unwrapped.fingerprint == load_backgrounds().fingerprint
+    assert gym.make(env_id, recolour=False).unwrapped.fingerprint == load_backgrounds().fingerprint
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def clip_settings(env_id: str) -> dict[str, dict[str, Any]]:
     """
     if not has_clips(env_id):
         return {"held-out layouts": {}}
-    return {"clips of pretraining": {"split": "train"}, "unseen clips": {"split": "eval"}}
+    return {"clips of pretraining": {"split": "train", "recolour": False}, "unseen clips": {"split": "eval"}}
 
 
 def clips_of(samples: Samples) -> Backgrounds | None:

@@ -136,6 +136,51 @@ class Backgrounds:
         return array
 
 
+class Looks:
+    """Other appearances of clips, one per environment: mirrored, their channels exchanged, each over another range.
+
+    A few clips have a few colours, and an encoder that has seen no others takes a saturated background for an agent
+    that has moved. Integer arithmetic only: the same bytes on every machine.
+
+    :param n_envs: number of environments
+    """
+
+    def __init__(self, n_envs: int) -> None:
+        self._flips = np.ones((n_envs, 2), dtype=np.int64)
+        self._channels = np.tile(np.arange(3), (n_envs, 1))
+        # Intensity x becomes (256 first + (last - first) x) / 256, from `first` at 0 to nearly `last` at 255.
+        self._first = np.zeros((n_envs, 3, 1, 1), dtype=np.uint16)
+        self._last = np.full((n_envs, 3, 1, 1), 256, dtype=np.uint16)
+
+    def draw(self, index: int, generator: np.random.Generator) -> None:
+        """A new look for environment ``index``; half of the looks keep the range of each channel.
+
+        :param index: of the environment
+        :param generator: of the episode
+        """
+        self._flips[index] = 1 - 2 * generator.integers(0, 2, 2)
+        self._channels[index] = generator.permutation(3)
+        first, last = generator.integers(0, 256, (2, 3, 1, 1))
+        keeps_range = generator.random() < 0.5
+        self._first[index], self._last[index] = (0, 256) if keeps_range else (first, last)
+
+    def apply(self, pictures: NDArray[np.uint8], indices: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Pictures as they look in their environments.
+
+        :param pictures: uint8 (m, 3, height, width)
+        :param indices: of environments, shape (m,)
+        :return: a new array of the same shape
+        """
+        turned = np.empty_like(pictures)
+        rows = zip(self._channels[indices].tolist(), self._flips[indices].tolist(), strict=True)
+        for i, (channels, (vertical, horizontal)) in enumerate(rows):
+            for shown, channel in enumerate(channels):
+                turned[i, shown] = pictures[i, channel, ::vertical, ::horizontal]
+        first, last = self._first[indices], self._last[indices]
+        # Where a range is turned round, both products wrap at 2^16, and their sum is right again.
+        return ((turned * (last - first) + np.uint16(256) * first) >> 8).astype(np.uint8)
+
+
 class BackgroundPlayer:
     """Plays backgrounds behind ``n_envs`` environments: one clip per episode, a random start, one frame per step.
 
@@ -146,10 +191,11 @@ class BackgroundPlayer:
     :param n_envs: number of environments
     :param order: "video", or "shuffled" for each clip's frames in a random order of the episode's own, which takes
         away the correlation between neighbouring frames
+    :param recolour: whether each episode shows its clip in a look of its own (:class:`Looks`)
     :raises ValueError: for an unknown order
     """
 
-    def __init__(self, backgrounds: Backgrounds, n_envs: int, order: str = "video") -> None:
+    def __init__(self, backgrounds: Backgrounds, n_envs: int, order: str = "video", recolour: bool = False) -> None:
         if order not in ORDERS:
             raise ValueError(f"order must be one of {ORDERS}, got {order!r}")
         self.backgrounds = backgrounds
@@ -158,6 +204,13 @@ class BackgroundPlayer:
         self._shuffles: list[NDArray[np.int64]] | None = None
         if order == "shuffled":
             self._shuffles = [np.zeros(1, dtype=np.int64)] * n_envs
+        self._looks = Looks(n_envs) if recolour else None
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the clips; another one where they are shown in other looks."""
+        plain = self.backgrounds.fingerprint
+        return plain if self._looks is None else hashlib.sha256(f"{plain} in looks".encode()).hexdigest()
 
     def start(self, index: int, generator: np.random.Generator) -> None:
         """Begin a new episode of environment ``index``.
@@ -165,13 +218,16 @@ class BackgroundPlayer:
         :param index: of the environment
         :param generator: three numbers are drawn from it
         """
-        clip_draw, start_draw, order_draw = generator.random(N_DRAWS).tolist()
+        clip_draw, start_draw, own_draw = generator.random(N_DRAWS).tolist()
         clip = int(clip_draw * self.backgrounds.n_clips)
         length = int(self.backgrounds.lengths[clip])
         self.clip[index] = clip
         self._position[index] = int(start_draw * length)
+        own = np.random.default_rng(int(own_draw * 2**53))
         if self._shuffles is not None:
-            self._shuffles[index] = np.random.default_rng(int(order_draw * 2**53)).permutation(length)
+            self._shuffles[index] = own.permutation(length)
+        if self._looks is not None:
+            self._looks.draw(index, own)
 
     def advance(self) -> None:
         """Go on by one frame in every environment."""
@@ -193,7 +249,8 @@ class BackgroundPlayer:
         """
         # Positions that are not shuffled need no folding here, `frames` does it.
         frame = self._position if self._shuffles is None else self.frame
-        return self.backgrounds.frames(self.clip[indices], frame[indices])
+        pictures = self.backgrounds.frames(self.clip[indices], frame[indices])
+        return pictures if self._looks is None else self._looks.apply(pictures, indices)
 
 
 def composite(

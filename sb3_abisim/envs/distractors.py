@@ -24,6 +24,9 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
     **Splits.** "train" and "eval" share no film and no photograph: pretrain and train on the one, evaluate on the
     other. "clean" shows the plain floor, for a comparison. The same seed gives the same mazes in all three.
 
+    **Looks.** In "train" each episode shows its clip in a look of its own, mirrored and in other colours
+    (:class:`~sb3_abisim.envs.backgrounds.Looks`), unless ``recolour`` is False; "eval" shows clips as they are.
+
     **Factors.** Those of PointMaze, and ``clip``, the index of the clip in the split, ``clip_id``, a number that stands
     for its content in any split, and ``frame``, the index of the frame shown; int64, each -1 in the split "clean".
 
@@ -33,6 +36,7 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
     :param order: "video", or "shuffled" for the frames of a clip in an order drawn for each episode, so that
         neighbouring frames are not alike
     :param clips: names of the clips to show; None for all of the split
+    :param recolour: whether "train" shows clips in looks drawn for each episode; of no effect in the other splits
     :param video_kwargs: further arguments of :func:`~sb3_abisim.envs.backgrounds.load_backgrounds`
     :param kwargs: arguments of PointMaze
     :raises ValueError: for unknown settings, and for what is wrong with the videos
@@ -46,6 +50,7 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
         split: str = "train",
         order: str = "video",
         clips: Sequence[str] | None = None,
+        recolour: bool = True,
         video_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -63,12 +68,12 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
             backgrounds = load_backgrounds(videos, split, **(video_kwargs or {}))
             if clips is not None:
                 backgrounds = backgrounds.select(clips)
-            self._player = BackgroundPlayer(backgrounds, num_envs, order)
+            self._player = BackgroundPlayer(backgrounds, num_envs, order, recolour and split == "train")
 
     @property
     def fingerprint(self) -> str:
-        """sha256 over the clips that can be shown, "clean" where there are none."""
-        return "clean" if self._player is None else self._player.backgrounds.fingerprint
+        """sha256 over the clips that can be shown and whether in other looks, "clean" where there are none."""
+        return "clean" if self._player is None else self._player.fingerprint
 
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         super()._reset_envs(indices)

@@ -46,6 +46,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
     :param backgrounds: clips to show on the floor, from
         :func:`~sb3_abisim.envs.backgrounds.load_backgrounds`; None for plain floor
     :param order: "video" or "shuffled", of the frames of a clip
+    :param recolour: whether each episode shows its clip in a look of its own, as the Distractor environments train
     :raises ValueError: for another kind of environment, a map of more than 21 cells a side, or ``frame_skip`` below 1
     """
 
@@ -59,6 +60,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         momentum: bool = True,
         backgrounds: Backgrounds | None = None,
         order: str = "video",
+        recolour: bool = False,
     ) -> None:
         self.env = env
         self.render_mode = "rgb_array"
@@ -78,7 +80,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         self._walls = self._draw_walls()
         self._goal = DiscPainter(GOAL_RADIUS * self._pixels_per_metre, IMAGE_SIZE, top_down.GOAL)
         self._agent = DiscPainter(AGENT_RADIUS * self._pixels_per_metre, IMAGE_SIZE)
-        self._player = None if backgrounds is None else BackgroundPlayer(backgrounds, 1, order)
+        self._player = None if backgrounds is None else BackgroundPlayer(backgrounds, 1, order, recolour)
 
     def _draw_walls(self) -> NDArray[np.bool_]:
         """The map fitted into the picture; sets the scale."""
