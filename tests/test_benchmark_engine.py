@@ -1,6 +1,7 @@
 """Cells run in order, once, by one writer at a time, and die with their engine."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -33,8 +34,6 @@ class FakeEngine:
         self.failing, self.ran, self.closed = failing, [], False
 
     def submit(self, root: Path, cell: Cell) -> "Future[None]":
-        import json
-
         from sb3_abisim.atomic import file_digest
 
         self.ran.append(cell.title)
@@ -95,6 +94,8 @@ def test_a_cell_in_a_program_of_its_own(tmp_path: Path) -> None:
     engine = LocalEngine(1)
     errors = run_cells(tmp_path, [bad, good], engine, progress=False)
     assert is_done(tmp_path, good.to_json()) and not is_done(tmp_path, bad.to_json())
+    marker = json.loads((tmp_path / "cells" / f"{good.name}.json").read_bytes())
+    assert marker["versions"]["torch"] and marker["hardware"]["processor"] and marker["hardware"]["n_processors"] >= 1
     log = (tmp_path / "logs" / f"{bad.name}.log").read_text()
     assert "$ python -m json.tool no_such_file bad.zip" in log
     assert list(errors) == ["bad"] and str(tmp_path / "logs" / f"{bad.name}.log") in errors["bad"]

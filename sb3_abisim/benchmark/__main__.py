@@ -11,12 +11,12 @@ from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark.cell import is_done
 from sb3_abisim.benchmark.engine import make_engine, run_cells
 from sb3_abisim.benchmark.evaluate import evaluate_final
-from sb3_abisim.benchmark.graph import Cell, Plan, build, run_label
+from sb3_abisim.benchmark.export import INDEX_NAME, export
+from sb3_abisim.benchmark.graph import Cell, Plan, build, run_labels
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.zoo import EXTRACTORS
 
 DEFAULT_ENV_IDS = ("Nav2D-v0", "PointMaze-v0", "DistractorPointMaze-v0")
-INDEX_NAME = "benchmark.json"
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -27,11 +27,12 @@ def main(argv: list[str] | None = None) -> None:
     :param argv: its words; the program's arguments by default
     """
     words = sys.argv[1:] if argv is None else argv
-    command, rest = (words[0], words[1:]) if words and words[0] in ("report", "evaluate") else ("run", words)
-    parser = {"run": _run_parser, "report": _report_parser, "evaluate": _evaluate_parser}[command]()
+    command, rest = (words[0], words[1:]) if words and words[0] in COMMANDS else ("run", words)
+    make_parser, run = COMMANDS[command]
+    parser = make_parser()
     args = parser.parse_args(rest)
     try:
-        {"run": _run, "report": _report, "evaluate": _evaluate}[command](args)
+        run(args)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     except KeyboardInterrupt:
@@ -42,7 +43,8 @@ def _run_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "python -m sb3_abisim.benchmark",
         description="Collect, pretrain, train and evaluate for every method, environment and seed; a rerun does only "
-        "what is missing. `report DIR` draws the comparison, `evaluate RUN` evaluates one run's final model.",
+        "what is missing. `report DIR` draws the comparison, `export DIR` makes a small copy for it, `evaluate RUN` "
+        "evaluates one run's final model.",
     )
     words = ", ".join(EXTRACTORS)
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
@@ -100,7 +102,8 @@ def _run(args: argparse.Namespace) -> None:
     root.mkdir(parents=True, exist_ok=True)
     engine = make_engine(args.engine, args.jobs, args.threads, **options)
     errors = run_cells(root, cells, engine)
-    runs = [{"folder": cell.output, "label": run_label(cell)} for cell in cells if cell.kind == "run"]
+    labels = run_labels(cells)
+    runs = [{"folder": cell.output, "label": labels[cell.name]} for cell in cells if cell.kind == "run"]
     index = {"plan": dataclasses.asdict(plan), "runs": runs}
     write_atomic(root / INDEX_NAME, lambda file: file.write(json.dumps(index, indent=1).encode()))
     if errors:
@@ -132,11 +135,19 @@ def _report_parser() -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", metavar="DIR", help="(default: report in the first folder)")
     parser.add_argument("--source", choices=("evaluations", "training"), default="evaluations",
                         help="learning curves from the zoo's evaluations or from the training episodes")  # fmt: skip
-    parser.add_argument("--reference", default="abisim", help="the method that the others are compared with")
-    parser.add_argument("--thresholds", nargs="+", type=float, default=[0.5, 0.7, 0.9],
-                        help="normalised returns, 0 (never at the goal) to 1 (default: 0.5 0.7 0.9)")  # fmt: skip
+    parser.add_argument("--reference", help="the method that the others are compared with (default: abisim)")
+    parser.add_argument("--thresholds", nargs="+", type=_threshold, metavar="NUMBER|METHOD",
+                        help="normalised returns, 0 (never at the goal) to 1, or methods, whose last return is meant "
+                        "(default: 0.5 0.7 0.9, and vanilla if it is there)")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
     return parser
+
+
+def _threshold(word: str) -> float | str:
+    try:
+        return float(word)
+    except ValueError:
+        return word
 
 
 def _report(args: argparse.Namespace) -> None:
@@ -158,6 +169,28 @@ def _evaluate_parser() -> argparse.ArgumentParser:
 
 def _evaluate(args: argparse.Namespace) -> None:
     print(evaluate_final(args.folder, args.episodes))
+
+
+def _export_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "python -m sb3_abisim.benchmark export",
+        description="Copy what the report reads, without models and training episodes, to be committed or sent.",
+    )
+    parser.add_argument("folder", metavar="DIR", help="a benchmark's folder, or a zoo log folder")
+    parser.add_argument("-o", "--output", required=True, metavar="NEW", help="the copy")
+    return parser
+
+
+def _export(args: argparse.Namespace) -> None:
+    print(export(args.folder, args.output))
+
+
+COMMANDS = {
+    "run": (_run_parser, _run),
+    "report": (_report_parser, _report),
+    "evaluate": (_evaluate_parser, _evaluate),
+    "export": (_export_parser, _export),
+}
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import platform
+import re
 import shutil
 import signal
 import socket
@@ -16,6 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +163,8 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
         "digest": file_digest(made / cell["proof"]),
         "seconds": round(time.monotonic() - start, 1),
         "host": socket.gethostname(),
-        "versions": {"sb3_abisim": __version__, "python": platform.python_version()},
+        "versions": {"sb3_abisim": __version__, "python": platform.python_version(), **_versions()},
+        "hardware": hardware(),
     }
     marker = marker_path(root, cell["name"])
     marker.parent.mkdir(exist_ok=True)
@@ -169,6 +172,27 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
     if made != output:
         # After the marker: a kill in between leaves no folder that would stand in the way.
         made.rename(output)
+
+
+def _versions() -> dict[str, str]:
+    """Of what the numbers rest on."""
+    names = ("torch", "numpy", "gymnasium", "mujoco", "stable_baselines3", "sb3_contrib", "rl_zoo3")
+    return {name: metadata.version(name) for name in names}
+
+
+def hardware() -> dict[str, Any]:
+    """Processor, how many of them this process may use, and graphics cards."""
+    found = None
+    with contextlib.suppress(OSError):
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    model = found.group(1) if found else platform.machine()
+    cards: list[str] = []
+    with contextlib.suppress(OSError):
+        query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        answer = subprocess.run(query, capture_output=True, text=True)
+        cards = answer.stdout.splitlines() if answer.returncode == 0 else []
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": model, "n_processors": count, "graphics_cards": cards}
 
 
 if __name__ == "__main__":
