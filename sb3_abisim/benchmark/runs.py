@@ -157,7 +157,9 @@ def find_runs(folder: str | Path) -> list[Run]:
             if (folder / entry["folder"]).is_dir()
         ]
     else:
-        runs = [read_run(path.parent.parent) for path in sorted(folder.glob("**/args.yml"))]
+        paths = sorted(path.parent.parent for path in folder.glob("**/args.yml"))
+        # Where a benchmark's cells work is nothing that is done.
+        runs = [read_run(path) for path in paths if not path.relative_to(folder).as_posix().startswith("work/run-")]
     if not runs:
         raise ValueError(f"no run folders of rl-zoo3 below {folder}; train first, or give its log folder")
     return runs
