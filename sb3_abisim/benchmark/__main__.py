@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from sb3_abisim.atomic import write_atomic
-from sb3_abisim.benchmark.cell import is_done
+from sb3_abisim.benchmark.cell import is_by_other_code, is_done
 from sb3_abisim.benchmark.engine import Engine, make_engine, run_cells
 from sb3_abisim.benchmark.evaluate import evaluate_final
 from sb3_abisim.benchmark.export import INDEX_NAME, export
@@ -124,7 +124,9 @@ def _run(args: argparse.Namespace) -> None:
 def _list(root: Path, cells: list[Cell]) -> None:
     for cell in cells:
         state = "done" if is_done(root, cell.to_json()) else "missing"
-        print(f"{state:8}{cell.name}  {cell.title}\n        python -m {' '.join(cell.command)}")
+        if state == "done" and is_by_other_code(root, cell.to_json()):
+            state = "other code"
+        print(f"{state:11}{cell.name}  {cell.title}\n           python -m {' '.join(cell.command)}")
 
 
 def _require_report() -> None:

@@ -24,6 +24,7 @@ from typing import Any
 import sb3_abisim
 from sb3_abisim._version import __version__
 from sb3_abisim.atomic import FolderLockedError, file_digest, folder_lock, write_atomic
+from sb3_abisim.benchmark.sources import source_digest
 
 # A worker that was lost may take this long to die and to let go of its cell.
 LOCK_PATIENCE_SECONDS = 60.0
@@ -50,6 +51,16 @@ def is_done(root: Path, cell: dict[str, Any]) -> bool:
         return bool(marker["digest"] == file_digest(root / cell["output"] / cell["proof"]))
     except FileNotFoundError:
         return False
+
+
+def is_by_other_code(root: Path, cell: dict[str, Any]) -> bool:
+    """Whether a cell that is done was made by other code than this; False where its marker does not say.
+
+    :param root: the benchmark's folder
+    :param cell: what :meth:`~sb3_abisim.benchmark.graph.Cell.to_json` gave
+    """
+    source = json.loads(marker_path(root, cell["name"]).read_bytes()).get("source")
+    return source is not None and source != source_digest(cell["kind"])
 
 
 class CellError(RuntimeError):
@@ -152,7 +163,7 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
         for leftover in work.iterdir():
             if leftover.is_dir():
                 shutil.rmtree(leftover)
-    start = time.monotonic()
+    start, source = time.monotonic(), source_digest(cell["kind"])
     print(f"$ python -m {' '.join(cell['command'])}", flush=True)
     code = subprocess.run([sys.executable, "-m", *cell["command"]], stdin=subprocess.DEVNULL).returncode
     if code:
@@ -162,6 +173,7 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
         **cell,
         "digest": file_digest(made / cell["proof"]),
         "seconds": round(time.monotonic() - start, 1),
+        "source": source,
         "host": socket.gethostname(),
         "versions": {"sb3_abisim": __version__, "python": platform.python_version(), **_versions()},
         "hardware": hardware(),

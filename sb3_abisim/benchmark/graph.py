@@ -2,7 +2,8 @@
 
 A cell's key is a hash over its kind, the package's version, its settings and the keys of its inputs. Two benchmarks
 that need the same dataset therefore find the same folder, and a changed setting gives new names to what depends on it
-and to nothing else. Changes of code without a change of version are not seen: remove the folder, or name a new one.
+and to nothing else. Changes of code without a change of version do not change the names; the cells' markers tell them
+(:mod:`sb3_abisim.benchmark.sources`).
 """
 
 import dataclasses
