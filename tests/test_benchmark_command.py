@@ -1,6 +1,7 @@
 """The command as a user types it."""
 
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -11,7 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sb3_abisim.atomic import file_digest
 from sb3_abisim.benchmark.__main__ import main
+from sb3_abisim.benchmark.graph import Plan, build
+from sb3_abisim.benchmark.sources import source_digest
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = [
@@ -48,6 +52,21 @@ def test_mistakes_end_with_2(
         main(words)
     assert stopped.value.code == 2 and message in capsys.readouterr().err
     assert not list(tmp_path.glob("**/logs")), "nothing was started"
+
+
+def test_cells_of_other_code_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = Plan(methods=("vanilla",), env_ids=("Nav2D-v0",), seeds=(0, 1), final_episodes=0)
+    for cell, source in zip(build(plan), (source_digest("run"), "other"), strict=True):
+        model = tmp_path / cell.output / cell.proof
+        model.parent.mkdir(parents=True)
+        model.write_text("model")
+        (tmp_path / "cells").mkdir(exist_ok=True)
+        marker = {"digest": file_digest(model), "source": source}
+        (tmp_path / "cells" / f"{cell.name}.json").write_text(json.dumps(marker))
+    words = ["--env", "Nav2D-v0", "--methods", "vanilla", "--seeds", "0", "1", "2", "--final-episodes", "0"]
+    main(["-o", str(tmp_path), *words, "--dry-run"])
+    lines = capsys.readouterr().out.splitlines()[::2]
+    assert [line.partition("run-")[0].strip() for line in lines] == ["done", "other code", "missing"]
 
 
 def test_what_the_report_needs_is_said_before_the_work(

@@ -1,6 +1,7 @@
 """Cells run in order, once, by one writer at a time, and die with their engine."""
 
 import contextlib
+import json
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from sb3_abisim.atomic import FolderLockedError, folder_lock, write_atomic
 from sb3_abisim.benchmark.cell import CellError, is_done
 from sb3_abisim.benchmark.engine import LocalEngine, done_share, make_engine, run_cells
 from sb3_abisim.benchmark.graph import Cell
+from sb3_abisim.benchmark.sources import source_digest
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -33,8 +35,6 @@ class FakeEngine:
         self.failing, self.ran, self.closed = failing, [], False
 
     def submit(self, root: Path, cell: Cell) -> "Future[None]":
-        import json
-
         from sb3_abisim.atomic import file_digest
 
         self.ran.append(cell.title)
@@ -95,9 +95,27 @@ def test_a_cell_in_a_program_of_its_own(tmp_path: Path) -> None:
     engine = LocalEngine(1)
     errors = run_cells(tmp_path, [bad, good], engine, progress=False)
     assert is_done(tmp_path, good.to_json()) and not is_done(tmp_path, bad.to_json())
+    marker = json.loads((tmp_path / "cells" / f"{good.name}.json").read_bytes())
+    assert marker["source"] == source_digest("encoder")
+    assert marker["versions"]["torch"] and marker["hardware"]["processor"] and marker["hardware"]["n_processors"] >= 1
     log = (tmp_path / "logs" / f"{bad.name}.log").read_text()
     assert "$ python -m json.tool no_such_file bad.zip" in log
     assert list(errors) == ["bad"] and str(tmp_path / "logs" / f"{bad.name}.log") in errors["bad"]
+
+
+def test_cells_of_other_code_are_kept_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run_cells(tmp_path, CELLS, FakeEngine(), progress=False)
+    sources = {"a": None, "b": source_digest("encoder"), "c": "other", "d": "other"}
+    for made in CELLS:
+        path = tmp_path / "cells" / f"{made.name}.json"
+        path.write_text(json.dumps(json.loads(path.read_bytes()) | {"source": sources[made.title]}))
+    capsys.readouterr()
+    engine = FakeEngine()
+    run_cells(tmp_path, CELLS, engine, progress=False)
+    assert engine.ran == []
+    message = capsys.readouterr().err
+    assert message.startswith("warning: 2 of 4 cells were made by other code of version ")
+    assert message.endswith("and are kept: c, d; take another folder to make all anew\n")
 
 
 def test_the_share_that_is_done(tmp_path: Path) -> None:

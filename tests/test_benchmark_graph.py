@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from sb3_abisim.benchmark.graph import Cell, Plan, build, run_label
+from sb3_abisim.benchmark.graph import Cell, Plan, build, run_labels
 from sb3_abisim.zoo import DISTRACTOR_IDS
 
 PLAN = Plan(methods=("abisim", "ssi", "vanilla"), env_ids=("Nav2D-v0", "DistractorPointMaze-v0"), seeds=(0, 1))
@@ -108,7 +108,10 @@ def test_a_given_encoder_is_known_by_its_content() -> None:
     (run,) = (cell for cell in build(plan) if cell.kind == "run")
     assert run.inputs == () and len(run.settings["encoder_digest"]) == 64
     assert "ssi=Nav2D-v0/ssi" in run.command
-    assert run_label(run) == f"ssi={run.settings['encoder_digest'][:6]}"
+    assert run_labels([run]) == {run.name: "ssi"}, "as the paper's table calls it"
+    several = build(dataclasses.replace(plan, methods=("ssi", "ssi=Nav2D-v0/ssi", "ssi=Nav2D-v0/ssi,frozen")))
+    labels = list(run_labels(several).values())
+    assert labels == ["ssi", f"ssi={run.settings['encoder_digest'][:6]}", "ssi,frozen"]
 
 
 def test_distractors_are_evaluated_on_three_splits() -> None:

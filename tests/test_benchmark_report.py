@@ -75,15 +75,32 @@ def test_curves_hold_mean_and_interval(made: Path) -> None:
 
 
 def test_thresholds_are_ratios_of_steps(made: Path) -> None:
-    table = {(r["env_id"], float(r["threshold"]), r["baseline"]): r for r in rows(made / "thresholds.csv")}
-    row = table["PointMaze-v0", 0.7, "ssi"]
+    table = {(r["env_id"], r["threshold"], r["baseline"]): r for r in rows(made / "thresholds.csv")}
+    row = table["PointMaze-v0", "0.7", "ssi"]
     # 0.7 of the way from -128 to 0, passed with the third evaluation after the jump (two of -20 do not suffice).
     assert float(row["return"]) == pytest.approx(-38.4)
     assert float(row["steps_reference"]) == 5500 and float(row["steps_baseline"]) == 9000
     assert float(row["ratio"]) == pytest.approx(5500 / 9000) and row["bound"] == ""
-    row = table["PointMaze-v0", 0.7, "vanilla"]
+    row = table["PointMaze-v0", "0.7", "vanilla"]
     assert (row["reached_reference"], row["reached_baseline"], row["bound"]) == ("2", "0", "<=")
     assert float(row["ratio"]) == pytest.approx(0.55)
+
+
+def test_where_a_baseline_ends_is_a_threshold(made: Path, logs: Path) -> None:
+    table = {(r["env_id"], r["threshold"], r["baseline"]): r for r in rows(made / "thresholds.csv")}
+    row = table["PointMaze-v0", "vanilla", "vanilla"]
+    # Of its last three evaluations, one run has -100, -20, -20, the other -100 throughout. A window with one -20 in it
+    # reaches that: at the jump itself.
+    assert float(row["return"]) == pytest.approx((-140 / 3 - 100) / 2)
+    assert float(row["steps_reference"]) == 3500 and float(row["steps_baseline"]) == (9000 + 10_000) / 2
+    assert float(row["ratio"]) == pytest.approx(3500 / 9500) and row["bound"] == "<="
+    assert float(row["low"]) <= 3500 / 9500 <= float(row["high"])
+    # Any method can be meant; the usual ones go when others are asked for.
+    found = compare([str(logs)], thresholds=["ssi"]).thresholds
+    assert {(r["threshold"], round(r["return"], 9)) for r in found} == {("ssi", -20.0)}
+    with pytest.raises(ValueError, match="a number or one of abisim, ssi, vanilla, got curl"):
+        compare([str(logs)], thresholds=[0.5, "curl"])
+    assert {r["threshold"] for r in compare([str(logs / "ssi")]).thresholds} == set(), "nothing to compare with"
 
 
 def test_final_table_stands_beside_the_papers(made: Path) -> None:
@@ -127,6 +144,7 @@ def test_page_needs_no_other_file_and_says_how_it_was_evaluated(made: Path) -> N
     assert "Evaluation is deterministic" in text and f"mean of {N_EPISODES} episodes" in text
     assert "python -m sb3_abisim.zoo train --seed 1" in text
     assert "0.61 times the steps of ssi" in text
+    assert "To the return that vanilla ends with (-73.33) ≤ 0.37 times the steps of vanilla" in text
     for name in ("curves", "thresholds", "splits", "aggregates", "profiles", "improvement"):
         with Image.open(made / f"{name}.png") as picture:
             assert len(picture.convert("RGB").getcolors(1 << 24)) > 10, name
@@ -156,6 +174,11 @@ def test_training_episodes_as_source(tmp_path: Path) -> None:
     text = (tmp_path / "report" / "index.html").read_text()
     assert "the training episodes themselves" in text and "Evaluation is deterministic" not in text
     assert "No aggregates across environments" in text
+
+
+def test_reference_is_the_first_method_where_ours_is_not_there(logs: Path) -> None:
+    folders = [str(logs / "vanilla"), str(logs / "ssi")]
+    assert compare(folders).reference == "vanilla" and compare([*folders, str(logs / "abisim")]).reference == "abisim"
 
 
 def test_labels(tmp_path: Path) -> None:

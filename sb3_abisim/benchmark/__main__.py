@@ -8,15 +8,15 @@ import sys
 from pathlib import Path
 
 from sb3_abisim.atomic import write_atomic
-from sb3_abisim.benchmark.cell import is_done
-from sb3_abisim.benchmark.engine import make_engine, run_cells
+from sb3_abisim.benchmark.cell import is_by_other_code, is_done
+from sb3_abisim.benchmark.engine import Engine, make_engine, run_cells
 from sb3_abisim.benchmark.evaluate import evaluate_final
-from sb3_abisim.benchmark.graph import Cell, Plan, build, run_label
+from sb3_abisim.benchmark.export import INDEX_NAME, export
+from sb3_abisim.benchmark.graph import Cell, Plan, build, run_labels
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.zoo import EXTRACTORS
 
 DEFAULT_ENV_IDS = ("Nav2D-v0", "PointMaze-v0", "DistractorPointMaze-v0")
-INDEX_NAME = "benchmark.json"
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -27,11 +27,12 @@ def main(argv: list[str] | None = None) -> None:
     :param argv: its words; the program's arguments by default
     """
     words = sys.argv[1:] if argv is None else argv
-    command, rest = (words[0], words[1:]) if words and words[0] in ("report", "evaluate") else ("run", words)
-    parser = {"run": _run_parser, "report": _report_parser, "evaluate": _evaluate_parser}[command]()
+    command, rest = (words[0], words[1:]) if words and words[0] in COMMANDS else ("run", words)
+    make_parser, run = COMMANDS[command]
+    parser = make_parser()
     args = parser.parse_args(rest)
     try:
-        {"run": _run, "report": _report, "evaluate": _evaluate}[command](args)
+        run(args)
     except (ValueError, FileNotFoundError) as error:
         parser.error(str(error))
     except KeyboardInterrupt:
@@ -42,7 +43,8 @@ def _run_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "python -m sb3_abisim.benchmark",
         description="Collect, pretrain, train and evaluate for every method, environment and seed; a rerun does only "
-        "what is missing. `report DIR` draws the comparison, `evaluate RUN` evaluates one run's final model.",
+        "what is missing. `report DIR` draws the comparison, `export DIR` makes a small copy for it, `evaluate RUN` "
+        "evaluates one run's final model, `sweep` searches settings of pretraining.",
     )
     words = ", ".join(EXTRACTORS)
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
@@ -50,6 +52,16 @@ def _run_parser() -> argparse.ArgumentParser:
                         help=f"of {words}; without an encoder, it is pretrained (default: all)")  # fmt: skip
     parser.add_argument("--env", nargs="+", default=list(DEFAULT_ENV_IDS), metavar="ID",
                         help=f"of {', '.join(ENV_IDS)} (default: the paper's)")  # fmt: skip
+    _add_budget(parser)
+    parser.add_argument("--final-episodes", type=int, default=100,
+                        help="of the final model on each split, 0 for none (default: 100)")  # fmt: skip
+    parser.add_argument("--dry-run", action="store_true", help="list the cells and their commands, and stop")
+    parser.add_argument("--no-report", action="store_true", help="do not draw the report at the end")
+    return parser
+
+
+def _add_budget(parser: argparse.ArgumentParser) -> None:
+    """What a sweep has in common with a benchmark."""
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4], help="of RL, one run each")
     parser.add_argument("--encoder-seeds", nargs="+", type=int,
                         help="of pretraining, taken by the runs in turn (default: those of --seeds)")  # fmt: skip
@@ -61,8 +73,6 @@ def _run_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--eval-episodes", type=int, default=20, help="of each evaluation (default: 20)")
     parser.add_argument("--n-eval-envs", type=int, default=5, help="evaluated side by side (default: 5)")
-    parser.add_argument("--final-episodes", type=int, default=100,
-                        help="of the final model on each split, 0 for none (default: 100)")  # fmt: skip
     parser.add_argument("-params", "--params", nargs="+", default=[], metavar="[ALGO.]NAME:VALUE",
                         help="RL hyperparameters, the same for all methods")  # fmt: skip
     parser.add_argument("--pretrain-params", nargs="+", default=[], metavar="[OBJECTIVE.]NAME:VALUE",
@@ -74,33 +84,34 @@ def _run_parser() -> argparse.ArgumentParser:
     parser.add_argument("--address", default="auto", help="of the Ray cluster (default: auto)")
     parser.add_argument("--gpus", type=float, default=0.0, help="per cell, on Ray (default: 0)")
     parser.add_argument("--retries", type=int, default=3, help="after a lost worker, on Ray (default: 3)")
-    parser.add_argument("--dry-run", action="store_true", help="list the cells and their commands, and stop")
-    parser.add_argument("--no-report", action="store_true", help="do not draw the report at the end")
-    return parser
+
+
+def _plan(args: argparse.Namespace, methods: list[str], env_ids: list[str], final_episodes: int) -> Plan:
+    return Plan(
+        methods=tuple(methods), env_ids=tuple(env_ids), seeds=tuple(args.seeds),
+        encoder_seeds=tuple(args.encoder_seeds or args.seeds), algo=args.algo, n_transitions=args.n_transitions,
+        n_timesteps=args.n_timesteps, eval_freq=args.eval_freq, eval_episodes=args.eval_episodes,
+        n_eval_envs=args.n_eval_envs, final_episodes=final_episodes, params=tuple(args.params),
+        pretrain_params=tuple(args.pretrain_params), device=args.device, threads=args.threads,
+    )  # fmt: skip
+
+
+def _engine(args: argparse.Namespace) -> Engine:
+    ray = {"address": args.address, "gpus": args.gpus, "retries": args.retries} if args.engine == "ray" else {}
+    return make_engine(args.engine, args.jobs, args.threads, **ray)
 
 
 def _run(args: argparse.Namespace) -> None:
-    plan = Plan(
-        methods=tuple(args.methods), env_ids=tuple(args.env), seeds=tuple(args.seeds),
-        encoder_seeds=tuple(args.encoder_seeds or args.seeds), algo=args.algo, n_transitions=args.n_transitions,
-        n_timesteps=args.n_timesteps, eval_freq=args.eval_freq, eval_episodes=args.eval_episodes,
-        n_eval_envs=args.n_eval_envs, final_episodes=args.final_episodes, params=tuple(args.params),
-        pretrain_params=tuple(args.pretrain_params), device=args.device, threads=args.threads,
-    )  # fmt: skip
+    plan = _plan(args, args.methods, args.env, args.final_episodes)
     cells, root = build(plan), Path(args.output)
     if args.dry_run:
         _list(root, cells)
         return
     if not args.no_report:
         _require_report()
-    if args.engine == "ray":
-        options = {"address": args.address, "gpus": args.gpus, "retries": args.retries}
-    else:
-        options = {}
-    root.mkdir(parents=True, exist_ok=True)
-    engine = make_engine(args.engine, args.jobs, args.threads, **options)
-    errors = run_cells(root, cells, engine)
-    runs = [{"folder": cell.output, "label": run_label(cell)} for cell in cells if cell.kind == "run"]
+    errors = run_cells(root, cells, _engine(args))
+    labels = run_labels(cells)
+    runs = [{"folder": cell.output, "label": labels[cell.name]} for cell in cells if cell.kind == "run"]
     index = {"plan": dataclasses.asdict(plan), "runs": runs}
     write_atomic(root / INDEX_NAME, lambda file: file.write(json.dumps(index, indent=1).encode()))
     if errors:
@@ -113,7 +124,9 @@ def _run(args: argparse.Namespace) -> None:
 def _list(root: Path, cells: list[Cell]) -> None:
     for cell in cells:
         state = "done" if is_done(root, cell.to_json()) else "missing"
-        print(f"{state:8}{cell.name}  {cell.title}\n        python -m {' '.join(cell.command)}")
+        if state == "done" and is_by_other_code(root, cell.to_json()):
+            state = "other code"
+        print(f"{state:11}{cell.name}  {cell.title}\n           python -m {' '.join(cell.command)}")
 
 
 def _require_report() -> None:
@@ -132,11 +145,19 @@ def _report_parser() -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", metavar="DIR", help="(default: report in the first folder)")
     parser.add_argument("--source", choices=("evaluations", "training"), default="evaluations",
                         help="learning curves from the zoo's evaluations or from the training episodes")  # fmt: skip
-    parser.add_argument("--reference", default="abisim", help="the method that the others are compared with")
-    parser.add_argument("--thresholds", nargs="+", type=float, default=[0.5, 0.7, 0.9],
-                        help="normalised returns, 0 (never at the goal) to 1 (default: 0.5 0.7 0.9)")  # fmt: skip
+    parser.add_argument("--reference", help="the method that the others are compared with (default: abisim)")
+    parser.add_argument("--thresholds", nargs="+", type=_threshold, metavar="NUMBER|METHOD",
+                        help="normalised returns, 0 (never at the goal) to 1, or methods, whose last return is meant "
+                        "(default: 0.5 0.7 0.9, and vanilla if it is there)")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
     return parser
+
+
+def _threshold(word: str) -> float | str:
+    try:
+        return float(word)
+    except ValueError:
+        return word
 
 
 def _report(args: argparse.Namespace) -> None:
@@ -158,6 +179,70 @@ def _evaluate_parser() -> argparse.ArgumentParser:
 
 def _evaluate(args: argparse.Namespace) -> None:
     print(evaluate_final(args.folder, args.episodes))
+
+
+def _export_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "python -m sb3_abisim.benchmark export",
+        description="Copy what the report reads, without models and training episodes, to be committed or sent.",
+    )
+    parser.add_argument("folder", metavar="DIR", help="a benchmark's folder, or a zoo log folder")
+    parser.add_argument("-o", "--output", required=True, metavar="NEW", help="the copy")
+    return parser
+
+
+def _export(args: argparse.Namespace) -> None:
+    print(export(args.folder, args.output))
+
+
+def _sweep_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        "python -m sb3_abisim.benchmark sweep",
+        description="Search settings of pretraining by the return of agents trained on the encoders, with Optuna; "
+        "the same command goes on where it was stopped.",
+    )
+    parser.add_argument("-o", "--output", default="sweep", metavar="DIR", help="folder; a benchmark's will do")
+    parser.add_argument("--method", default="abisim", metavar="METHOD[,frozen]", help="to pretrain (default: abisim)")
+    parser.add_argument("--env", required=True, metavar="ID", help=f"one of {', '.join(ENV_IDS)}")
+    parser.add_argument("--space", required=True, nargs="+", metavar="NAME=VALUES",
+                        help="what to search: objective_kwargs.c=0.5..0.99 learning_rate=1e-4..1e-3:log "
+                        "objective_kwargs.pairs=random|near; ssi.NAME=VALUES for the base's")  # fmt: skip
+    parser.add_argument("--n-trials", type=int, default=20, help="(default: 20)")
+    parser.add_argument("--batch", type=int, default=1, help="trials proposed at a time (default: 1)")
+    parser.add_argument("--metric", choices=("final", "area"), default="final",
+                        help="return of the last three evaluations, or of all of them (default: final)")  # fmt: skip
+    parser.add_argument("--sampler-seed", type=int, default=0)
+    _add_budget(parser)
+    return parser
+
+
+def _sweep(args: argparse.Namespace) -> None:
+    from sb3_abisim.benchmark.sweep import TABLE_NAME, best_of, sweep
+
+    root = Path(args.output)
+    plan = _plan(args, [args.method], [args.env], final_episodes=0)
+    trials = sweep(
+        root, plan, args.space, args.n_trials, lambda: _engine(args), args.metric, args.batch, args.sampler_seed
+    )
+    print(f"trials: {root / TABLE_NAME}")
+    best = best_of(trials)
+    if best is not None:
+        print(f"best is trial {best.number + 1}, {args.metric} {best.value:.2f}: {' '.join(best.encoders)}")
+        words = " ".join([*args.pretrain_params, *best.words])
+        print(f"python -m sb3_abisim.benchmark --methods {args.method} --env {args.env} --pretrain-params {words}")
+    n_failed = sum(not trial.returns for trial in trials)
+    if n_failed:
+        print(f"{n_failed} trials failed; the logs are in {root / 'logs'}", file=sys.stderr)
+        sys.exit(1)
+
+
+COMMANDS = {
+    "run": (_run_parser, _run),
+    "report": (_report_parser, _report),
+    "evaluate": (_evaluate_parser, _evaluate),
+    "export": (_export_parser, _export),
+    "sweep": (_sweep_parser, _sweep),
+}
 
 
 if __name__ == "__main__":

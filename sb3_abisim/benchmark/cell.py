@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import platform
+import re
 import shutil
 import signal
 import socket
@@ -16,12 +17,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import sb3_abisim
 from sb3_abisim._version import __version__
 from sb3_abisim.atomic import FolderLockedError, file_digest, folder_lock, write_atomic
+from sb3_abisim.benchmark.sources import source_digest
 
 # A worker that was lost may take this long to die and to let go of its cell.
 LOCK_PATIENCE_SECONDS = 60.0
@@ -48,6 +51,16 @@ def is_done(root: Path, cell: dict[str, Any]) -> bool:
         return bool(marker["digest"] == file_digest(root / cell["output"] / cell["proof"]))
     except FileNotFoundError:
         return False
+
+
+def is_by_other_code(root: Path, cell: dict[str, Any]) -> bool:
+    """Whether a cell that is done was made by other code than this; False where its marker does not say.
+
+    :param root: the benchmark's folder
+    :param cell: what :meth:`~sb3_abisim.benchmark.graph.Cell.to_json` gave
+    """
+    source = json.loads(marker_path(root, cell["name"]).read_bytes()).get("source")
+    return source is not None and source != source_digest(cell["kind"])
 
 
 class CellError(RuntimeError):
@@ -150,7 +163,7 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
         for leftover in work.iterdir():
             if leftover.is_dir():
                 shutil.rmtree(leftover)
-    start = time.monotonic()
+    start, source = time.monotonic(), source_digest(cell["kind"])
     print(f"$ python -m {' '.join(cell['command'])}", flush=True)
     code = subprocess.run([sys.executable, "-m", *cell["command"]], stdin=subprocess.DEVNULL).returncode
     if code:
@@ -160,8 +173,10 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
         **cell,
         "digest": file_digest(made / cell["proof"]),
         "seconds": round(time.monotonic() - start, 1),
+        "source": source,
         "host": socket.gethostname(),
-        "versions": {"sb3_abisim": __version__, "python": platform.python_version()},
+        "versions": {"sb3_abisim": __version__, "python": platform.python_version(), **_versions()},
+        "hardware": hardware(),
     }
     marker = marker_path(root, cell["name"])
     marker.parent.mkdir(exist_ok=True)
@@ -169,6 +184,27 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
     if made != output:
         # After the marker: a kill in between leaves no folder that would stand in the way.
         made.rename(output)
+
+
+def _versions() -> dict[str, str]:
+    """Of what the numbers rest on."""
+    names = ("torch", "numpy", "gymnasium", "mujoco", "stable_baselines3", "sb3_contrib", "rl_zoo3")
+    return {name: metadata.version(name) for name in names}
+
+
+def hardware() -> dict[str, Any]:
+    """Processor, how many of them this process may use, and graphics cards."""
+    found = None
+    with contextlib.suppress(OSError):
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    model = found.group(1) if found else platform.machine()
+    cards: list[str] = []
+    with contextlib.suppress(OSError):
+        query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        answer = subprocess.run(query, capture_output=True, text=True)
+        cards = answer.stdout.splitlines() if answer.returncode == 0 else []
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": model, "n_processors": count, "graphics_cards": cards}
 
 
 if __name__ == "__main__":

@@ -26,6 +26,9 @@ PAPER = {
     },
 }  # fmt: skip
 PROFILE_TAUS = np.linspace(0.0, 1.0, 101)
+# Shares of the way to the best return, and the return that a method ends with.
+DEFAULT_THRESHOLDS: tuple[float | str, ...] = (0.5, 0.7, 0.9)
+DEFAULT_REFERENCE, FROM_SCRATCH = "abisim", "vanilla"
 Row = dict[str, Any]
 
 
@@ -58,6 +61,10 @@ class Group:
                 return np.array([final[name] for final in self.finals])
         return np.array([curve.returns[-1] for curve in self.curves])
 
+    def end(self) -> float:
+        """Mean over runs of where their curves end, as :func:`~statistics.steps_to_threshold` measures arrival."""
+        return float(np.mean([curve.returns[-statistics.WINDOW :].mean() for curve in self.curves]))
+
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
@@ -88,27 +95,41 @@ class Comparison:
 
 
 def compare(
-    folders: Sequence[str], source: str, reference: str, thresholds: Sequence[float], seed: int = 0
+    folders: Sequence[str],
+    source: str = "evaluations",
+    reference: str | None = None,
+    thresholds: Sequence[float | str] | None = None,
+    seed: int = 0,
 ) -> Comparison:
     """Read runs and compute everything.
 
     :param folders: each a folder, or ``LABEL=FOLDER`` to call all runs below it LABEL
     :param source: "evaluations" (the zoo's, during training) or "training" (the training episodes themselves)
-    :param reference: label of the method to compare with the others
-    :param thresholds: normalised returns, between 0 and 1
+    :param reference: label of the method to compare with the others; None takes abisim, or else the first
+    :param thresholds: normalised returns, between 0 and 1, or labels: the mean return that this method ends with; None
+        takes 0.5, 0.7, 0.9 and, where there are such runs, vanilla
     :param seed: of the bootstrap
     :raises ValueError: if the runs cannot be compared, with the remedy
     """
     if source not in ("evaluations", "training"):
         raise ValueError(f"source must be 'evaluations' or 'training', got {source!r}")
-    bad = [value for value in thresholds if not 0 < value <= 1]
-    if bad or not thresholds:
-        raise ValueError(f"thresholds are normalised returns above 0 and up to 1, got {bad}")
-    notes: list[str] = []
-    groups = _groups(folders, source, reference, notes)
-    labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
+    bad = [value for value in thresholds or () if not isinstance(value, str) and not 0 < value <= 1]
+    if bad or (thresholds is not None and not thresholds):
+        raise ValueError(f"thresholds are methods, or normalised returns above 0 and up to 1, got {bad}")
+    runs = _labelled_runs(folders)
+    labels = list(dict.fromkeys(run.label for run in runs))
+    if reference is None:
+        reference = DEFAULT_REFERENCE if DEFAULT_REFERENCE in labels else labels[0]
     if reference not in labels:
         raise ValueError(f"no runs of the reference {reference!r} among {', '.join(labels)}; give --reference")
+    if thresholds is None:
+        thresholds = (*DEFAULT_THRESHOLDS, *((FROM_SCRATCH,) if FROM_SCRATCH in labels else ()))
+    unknown = [value for value in thresholds if isinstance(value, str) and value not in labels]
+    if unknown:
+        raise ValueError(f"a threshold is a number or one of {', '.join(labels)}, got {', '.join(unknown)}")
+    notes: list[str] = []
+    groups = _groups(runs, source, reference, notes)
+    labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
     aggregates, profiles, improvement = _across(groups, labels, reference, seed, notes)
     return Comparison(
         groups, reference, source, _curve_rows(groups), _final_rows(groups),
@@ -127,9 +148,9 @@ def _labelled_runs(folders: Sequence[str]) -> list[Run]:
     return runs
 
 
-def _groups(folders: Sequence[str], source: str, reference: str, notes: list[str]) -> dict[str, dict[str, Group]]:
+def _groups(all_runs: list[Run], source: str, reference: str, notes: list[str]) -> dict[str, dict[str, Group]]:
     found: dict[str, dict[str, list[Run]]] = {}
-    for run in _labelled_runs(folders):
+    for run in all_runs:
         found.setdefault(run.env_id, {}).setdefault(run.label, []).append(run)
     groups: dict[str, dict[str, Group]] = {}
     order = [env_id for env_id in ENV_IDS if env_id in found] + [env_id for env_id in found if env_id not in ENV_IDS]
@@ -221,7 +242,7 @@ def _final_rows(groups: dict[str, dict[str, Group]]) -> list[Row]:
 
 
 def _threshold_rows(
-    groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float], seed: int
+    groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float | str], seed: int
 ) -> list[Row]:
     rows = []
     for env_id, methods in groups.items():
@@ -229,8 +250,13 @@ def _threshold_rows(
             continue
         horizon = int(min(curve.steps[-1] for group in methods.values() for curve in group.curves))
         for threshold in thresholds:
-            first = methods[reference]
-            level = first.low + threshold * (first.high - first.low)
+            if isinstance(threshold, str):
+                if threshold not in methods:
+                    continue
+                level = methods[threshold].end()
+            else:
+                first = methods[reference]
+                level = first.low + threshold * (first.high - first.low)
             steps = {
                 label: np.array(
                     [statistics.steps_to_threshold(c.steps, c.returns, level, horizon) for c in group.curves]

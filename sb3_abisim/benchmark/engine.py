@@ -16,14 +16,16 @@ from typing import Any, Protocol
 import numpy as np
 from tqdm import tqdm
 
+from sb3_abisim._version import __version__
 from sb3_abisim.atomic import folder_lock
-from sb3_abisim.benchmark.cell import is_done, kill, launch, marker_path
+from sb3_abisim.benchmark.cell import is_by_other_code, is_done, kill, launch, marker_path
 from sb3_abisim.benchmark.graph import Cell
 
 REFRESH_SECONDS = 1.0
 # Before anything has been measured: seconds per transition, update, step and episode.
 _FIRST_GUESS = {"data": 2e-4, "encoder": 2e-2, "run": 1e-3, "final": 5e-2}
 _START_SECONDS = 5.0
+_N_NAMED = 5
 
 
 class Engine(Protocol):
@@ -110,6 +112,7 @@ class _Run:
 
     def run(self) -> dict[str, str]:
         n_kept = len(self.done)
+        self._warn_of_other_code()
         try:
             self._show()
             self._submit_ready()
@@ -125,6 +128,14 @@ class _Run:
             state = f"{len(self.done)} of {len(self.cells)} cells done, {n_kept} of them before"
             print(f"{state}; {len(self.errors)} failed", file=sys.stderr)
         return self.errors
+
+    def _warn_of_other_code(self) -> None:
+        kept = [cell for cell in self.cells if cell.name in self.done]
+        titles = [cell.title for cell in kept if is_by_other_code(self.root, cell.to_json())]
+        if titles:
+            names = ", ".join(titles[:_N_NAMED]) + (f" and {len(titles) - _N_NAMED} more" if titles[_N_NAMED:] else "")
+            what = f"{len(titles)} of {len(self.cells)} cells were made by other code of version {__version__}"
+            print(f"warning: {what} and are kept: {names}; take another folder to make all anew", file=sys.stderr)
 
     def _submit_ready(self) -> None:
         for cell in list(self.waiting):

@@ -115,7 +115,8 @@ def _thresholds(comparison: Comparison, colours: dict[str, str]) -> "Figure | No
         for y, row in enumerate(shown):
             _interval(axis, y, row["ratio"], row["low"], row["high"], colours[row["baseline"]], row["bound"])
         axis.axvline(1, color=GREY, lw=1)
-        names = [f"{row['baseline']}, return {row['return']:g}" for row in shown]
+        ends = [" (its end)" if row["threshold"] == row["baseline"] else "" for row in shown]
+        names = [f"{row['baseline']}, return {row['return']:.4g}{end}" for row, end in zip(shown, ends, strict=True)]
         axis.set_yticks(range(len(shown)), names)
         axis.set_xscale("log")
         axis.set_xlim(*_log_limits([row[key] for row in shown for key in ("ratio", "low", "high")]))

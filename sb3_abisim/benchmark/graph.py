@@ -2,7 +2,8 @@
 
 A cell's key is a hash over its kind, the package's version, its settings and the keys of its inputs. Two benchmarks
 that need the same dataset therefore find the same folder, and a changed setting gives new names to what depends on it
-and to nothing else. Changes of code without a change of version are not seen: remove the folder, or name a new one.
+and to nothing else. Changes of code without a change of version do not change the names; the cells' markers tell them
+(:mod:`sb3_abisim.benchmark.sources`).
 """
 
 import dataclasses
@@ -226,14 +227,27 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
     return Cell("run", title, settings, inputs, tuple(command), output, f"{env_id}.zip", n)
 
 
-def run_label(run: Cell) -> str:
-    """What a report calls a run: its method, and the encoder where one was given.
+def run_labels(cells: list[Cell]) -> dict[str, str]:
+    """What a report calls the runs: their method, and the encoder where the method has several given ones.
 
-    :param run: what :func:`run_cell` made
+    :param cells: what :func:`build` made
+    :return: name of each run's cell to its label
     """
-    settings = run.settings
-    given = f"={settings['encoder_digest'][:6]}" if "encoder_digest" in settings else ""
-    return f"{settings['method']}{given}{',frozen' if settings['frozen'] else ''}"
+    runs = [cell for cell in cells if cell.kind == "run"]
+    given: dict[tuple[str, str], set[str]] = {}
+    for run in runs:
+        given.setdefault((_method(run), run.settings["env_id"]), set()).add(run.settings.get("encoder_digest", ""))
+    several = {method for (method, _), digests in given.items() if len(digests) > 1}
+    labels = {}
+    for run in runs:
+        digest = run.settings.get("encoder_digest")
+        name, comma, frozen = _method(run).partition(",")
+        labels[run.name] = f"{name}{f'={digest[:6]}' if digest and _method(run) in several else ''}{comma}{frozen}"
+    return labels
+
+
+def _method(run: Cell) -> str:
+    return f"{run.settings['method']}{',frozen' if run.settings['frozen'] else ''}"
 
 
 def final_cell(plan: Plan, run: Cell) -> Cell:

@@ -14,7 +14,7 @@ from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark import statistics
 from sb3_abisim.benchmark.comparison import Comparison, Row, compare
 from sb3_abisim.benchmark.figures import SPLIT_NAMES, draw
-from sb3_abisim.benchmark.runs import is_deterministic
+from sb3_abisim.benchmark.runs import Run, is_deterministic
 from sb3_abisim.zoo import DISTRACTOR_IDS
 
 METHOD_NAMES = {
@@ -33,8 +33,8 @@ def report(
     folders: Sequence[str],
     output: str | Path | None = None,
     source: str = "evaluations",
-    reference: str = "abisim",
-    thresholds: Sequence[float] = (0.5, 0.7, 0.9),
+    reference: str | None = None,
+    thresholds: Sequence[float | str] | None = None,
     seed: int = 0,
 ) -> Path:
     """Compare runs and write the report; the same runs and arguments give the same files.
@@ -42,8 +42,8 @@ def report(
     :param folders: as for :func:`~sb3_abisim.benchmark.comparison.compare`
     :param output: folder for the files; None for ``report`` in the first of ``folders``
     :param source: "evaluations" or "training"
-    :param reference: label of the method that the others are compared with
-    :param thresholds: normalised returns
+    :param reference: label of the method that the others are compared with; None takes abisim, or else the first
+    :param thresholds: normalised returns, or methods whose last return is meant; None for the usual ones
     :param seed: of the bootstrap
     :return: the page
     :raises ValueError: if the runs cannot be compared
@@ -83,7 +83,7 @@ def render(comparison: Comparison, pictures: dict[str, bytes]) -> str:
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters |= {"number": _number, "plus_minus": _plus_minus, "ratio": _ratio}
+    environment.filters |= {"number": _number, "place": _place, "plus_minus": _plus_minus, "ratio": _ratio}
     template = environment.from_string(resources.files(__package__).joinpath("report.html").read_text(encoding="utf-8"))
     images = {name: f"data:image/png;base64,{base64.b64encode(data).decode()}" for name, data in pictures.items()}
     labels = list(dict.fromkeys(label for methods in comparison.groups.values() for label in methods))
@@ -131,21 +131,26 @@ def _groups(comparison: Comparison) -> list[tuple[str, Any]]:
 
 
 def _card(comparison: Comparison, env_id: str) -> dict[str, Any]:
-    """What a reader in a hurry takes away: the highest threshold that all runs of the reference reached."""
-    rows = [row for row in comparison.thresholds if row["env_id"] == env_id and row["baseline"] != comparison.reference]
+    """What a reader in a hurry takes away: the highest return that all runs of the reference reached, against each
+    baseline; and the return that a baseline ends with, against that baseline."""
+    rows = [row for row in comparison.thresholds if row["env_id"] == env_id]
     always = [row for row in rows if row["reached_reference"] == row["n_reference"]]
-    rows = [row for row in always if row["threshold"] == max(r["threshold"] for r in always)]
-    lines = [
-        f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f} times the steps of {row['baseline']}: {_verdict(row)}"
-        for row in rows
-    ]
+    highest = max((row["return"] for row in always), default=None)
+    ends = [row for row in rows if row["threshold"] == row["baseline"]]
     counts = {len(group.runs) for group in comparison.groups[env_id].values()}
     return {
         "env_id": env_id,
         "n_runs": f"{min(counts)} to {max(counts)}" if len(counts) > 1 else str(min(counts)),
-        "level": rows[0]["return"] if rows else None,
-        "lines": lines,
+        "level": highest,
+        "lines": [_sentence(row) for row in always if row["return"] == highest],
+        "ends": [{"baseline": row["baseline"], "level": row["return"], "line": _sentence(row)} for row in ends],
     }
+
+
+def _sentence(row: Row) -> str:
+    if not math.isfinite(row["ratio"]):
+        return f"{row['baseline']}: none arrived"
+    return f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f} times the steps of {row['baseline']}: {_verdict(row)}"
 
 
 def _verdict(row: Row) -> str:
@@ -180,6 +185,11 @@ def _split_table(comparison: Comparison) -> list[dict[str, Any]]:
             entry = table.setdefault(key, dict(zip(("env_id", "method", "mode"), key, strict=True)))
             entry[row["split"]] = (row["mean"], row["half_width"])
     return list(table.values())
+
+
+def _place(run: Run) -> str:
+    """Where a run lies, without what is above: METHOD/ALGO/ENV_NUMBER."""
+    return "/".join(run.folder.parts[-3:])
 
 
 def _number(value: float) -> str:

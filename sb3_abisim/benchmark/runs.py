@@ -77,7 +77,7 @@ class Run:
         path = self.folder / "evaluations.npz"
         if not path.is_file():
             raise ValueError(f"{self.folder} holds no evaluations.npz; train with an --eval-freq above 0")
-        data = np.load(path)
+        data = np.load(path, allow_pickle=False)
         successes = data["successes"].mean(axis=1) if "successes" in data else None
         return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
 
@@ -90,7 +90,8 @@ class Run:
         from stable_baselines3.common.monitor import load_results
 
         if not list(self.folder.glob("*.monitor.csv")):
-            raise ValueError(f"{self.folder} holds no *.monitor.csv; it is no run folder of the zoo")
+            what = f"{self.folder} holds no *.monitor.csv (an exported benchmark keeps no training episodes)"
+            raise ValueError(f"{what}; take --source evaluations, or the original folder")
         # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
         episodes = load_results(str(self.folder))
         ends = episodes["l"].cumsum().to_numpy()
@@ -104,7 +105,7 @@ class Run:
     def final(self) -> dict[str, NDArray[Any]] | None:
         """What :mod:`sb3_abisim.benchmark.evaluate` wrote: ``<mode>/<split>/results`` and so on; None if it did not."""
         path = self.folder / "final_evaluations.npz"
-        return dict(np.load(path)) if path.is_file() else None
+        return dict(np.load(path, allow_pickle=False)) if path.is_file() else None
 
 
 def read_run(folder: str | Path) -> Run:
@@ -156,7 +157,9 @@ def find_runs(folder: str | Path) -> list[Run]:
             if (folder / entry["folder"]).is_dir()
         ]
     else:
-        runs = [read_run(path.parent.parent) for path in sorted(folder.glob("**/args.yml"))]
+        paths = sorted(path.parent.parent for path in folder.glob("**/args.yml"))
+        # Where a benchmark's cells work is nothing that is done.
+        runs = [read_run(path) for path in paths if not path.relative_to(folder).as_posix().startswith("work/run-")]
     if not runs:
         raise ValueError(f"no run folders of rl-zoo3 below {folder}; train first, or give its log folder")
     return runs

@@ -1,0 +1,90 @@
+"""Copy of a benchmark that is small enough to commit: what the report reads, and how each cell was made.
+
+Models, datasets, encoders and monitor files stay behind, and so do the names of the folders that they lay in.
+"""
+
+import io
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_abisim.atomic import write_atomic
+from sb3_abisim.benchmark.runs import Run, find_runs
+
+INDEX_NAME = "benchmark.json"
+TEXTS = ("args.yml", "config.yml", "command.txt")
+EVALUATIONS = ("evaluations.npz", "final_evaluations.npz")
+# An absolute path up to its last part: not within a word, a relative path or a URL.
+_ABSOLUTE = re.compile(r"(?<![\w.~/-])/(?:[^\s/'\",:=\\]+/)*(?=[\w.])")
+
+
+def export(folder: str | Path, output: str | Path) -> Path:
+    """Copy what a report on the runs of a folder needs; it gives the same tables from the copy.
+
+    :param folder: a benchmark's folder, or a zoo's log folder
+    :param output: a new folder
+    :return: ``output``
+    :raises ValueError: if there are no runs, or ``output`` is there
+    """
+    folder, output = Path(folder), Path(output)
+    if output.exists():
+        raise ValueError(f"{output} is there; remove it, or name another folder")
+    runs = find_runs(folder)
+    # Under another name until it is whole.
+    part = output.with_name(f".{output.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    for run in runs:
+        _copy_run(run, folder, part / run.folder.relative_to(folder))
+    _copy_markers(runs, folder, part)
+    index = json.loads((folder / INDEX_NAME).read_bytes()) if (folder / INDEX_NAME).is_file() else {}
+    index["runs"] = [{"folder": run.folder.relative_to(folder).as_posix(), "label": run.label} for run in runs]
+    _write(part / INDEX_NAME, without_folders(json.dumps(index, indent=1), folder))
+    part.rename(output)
+    return output
+
+
+def without_folders(text: str, root: Path) -> str:
+    """A text with no absolute path in it: those below ``root`` become relative, of all others the last part stays.
+
+    :param text: of a settings file or a command
+    :param root: the benchmark's folder
+    """
+    return _ABSOLUTE.sub("", text.replace(f"{root.resolve()}/", ""))
+
+
+def _copy_run(run: Run, root: Path, target: Path) -> None:
+    for name in TEXTS:
+        source = run.folder / run.env_id / name
+        if source.is_file():
+            _write(target / run.env_id / name, without_folders(source.read_text(encoding="utf-8"), root))
+    for name in EVALUATIONS:
+        if (run.folder / name).is_file():
+            with np.load(run.folder / name, allow_pickle=False) as arrays:
+                buffer = io.BytesIO()
+                np.savez_compressed(buffer, **arrays)
+            write_atomic(target / name, lambda file, buffer=buffer: file.write(buffer.getvalue()))  # type: ignore[misc]
+
+
+def _copy_markers(runs: list[Run], root: Path, target: Path) -> None:
+    """How the runs, and what they rest on, were made: by which command, with which versions, on what, for how long."""
+    markers: dict[str, dict[str, Any]] = {}
+    for path in sorted((root / "cells").glob("*.json")):
+        markers[path.stem] = json.loads(path.read_bytes())
+    outputs = {run.folder.relative_to(root).as_posix() for run in runs}
+    names = [name for name, marker in markers.items() if marker["output"] in outputs]
+    for name in names:  # grows while it is walked
+        names += [source for source in markers[name]["inputs"] if source in markers and source not in names]
+    for name in names:
+        # The name of a machine says nothing elsewhere.
+        kept = {key: value for key, value in markers[name].items() if key != "host"}
+        _write(target / "cells" / f"{name}.json", without_folders(json.dumps(kept, indent=1), root))
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, lambda file: file.write(text.encode()))
