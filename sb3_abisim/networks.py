@@ -106,9 +106,9 @@ class Nav2DEncoder(Encoder):
     def __init__(self, n_input_channels: int = 3) -> None:
         layers = nn.Sequential(
             nn.Conv2d(n_input_channels, 32, 3, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, 3),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(64, 64, 3),
             nn.Flatten(),
         )
@@ -130,10 +130,11 @@ class PointMazeEncoder(Encoder):
     def __init__(self, n_input_channels: int = 3, features_dim: int = 32) -> None:
         layers = nn.Sequential(
             nn.Conv2d(n_input_channels, 8, 3, stride=2, padding=1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(8, 16, 3, stride=2, padding=1),
-            nn.ReLU(),
+            # The two commute, and this way round there is a quarter to rectify.
             nn.MaxPool2d(2),
+            nn.ReLU(inplace=True),
             nn.Conv2d(16, features_dim, 8),
             nn.Flatten(),
         )
