@@ -5,6 +5,7 @@ trains on -1..+1, so that affine map is the encoder's first layer.
 """
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +17,9 @@ from sb3_abisim.scan_networks import FEATURES_DIM, resnet18_layers, small_layers
 
 class Encoder(nn.Module):
     """A convolutional network from images to an embedding, rebuilt from :meth:`spec` alone.
+
+    Its weights lie in memory with channels last, and so do the activations that torch makes with them: on a CPU the
+    layout in which small convolutions are fastest.
 
     :param layers: module from float images (batch, channels, height, width) in -1..1 to (batch, features_dim)
     :param features_dim: size of the embedding
@@ -34,6 +38,20 @@ class Encoder(nn.Module):
         self.scale: th.Tensor
         self.register_buffer("offset", th.zeros(features_dim))
         self.register_buffer("scale", th.ones(()))
+        self._lay_out(th.channels_last)
+
+    def _lay_out(self, memory_format: th.memory_format) -> None:
+        self.to(memory_format=memory_format)  # type: ignore[call-overload]
+
+    def apply(self, fn: Callable[[nn.Module], None]) -> "Encoder":
+        """As in torch, whose ``orthogonal_`` (which SB3 initialises with) takes no weights with channels last.
+
+        :param fn: called on every submodule
+        """
+        self._lay_out(th.contiguous_format)
+        super().apply(fn)
+        self._lay_out(th.channels_last)
+        return self
 
     def spec(self) -> dict[str, Any]:
         """The architecture as JSON: ``make_encoder(space, spec["name"], **spec["kwargs"])`` builds it again."""
@@ -88,9 +106,9 @@ class Nav2DEncoder(Encoder):
     def __init__(self, n_input_channels: int = 3) -> None:
         layers = nn.Sequential(
             nn.Conv2d(n_input_channels, 32, 3, stride=2),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, 3),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(64, 64, 3),
             nn.Flatten(),
         )
@@ -112,10 +130,11 @@ class PointMazeEncoder(Encoder):
     def __init__(self, n_input_channels: int = 3, features_dim: int = 32) -> None:
         layers = nn.Sequential(
             nn.Conv2d(n_input_channels, 8, 3, stride=2, padding=1),
-            nn.ReLU(),
+            nn.ReLU(inplace=True),
             nn.Conv2d(8, 16, 3, stride=2, padding=1),
-            nn.ReLU(),
+            # The two commute, and this way round there is a quarter to rectify.
             nn.MaxPool2d(2),
+            nn.ReLU(inplace=True),
             nn.Conv2d(16, features_dim, 8),
             nn.Flatten(),
         )

