@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 import sb3_abisim.envs.base
 from sb3_abisim.dataset_format import (
     CUT,
+    DRAWN_FORMAT_VERSION,
     FORMAT_VERSION,
     TERMINATED,
     TRUNCATED,
@@ -89,10 +90,10 @@ def _collect(
 
     observation_space, action_space = env.single_observation_space, env.single_action_space
     check_spaces(observation_space, action_space)
-    steps = _steps_per_shard(env, env_id, env_kwargs)
     env.reset(seed=seed)  # factors need a state; every shard resets again
+    steps = _steps_per_shard(env, env_id, env_kwargs)
     identity = {
-        "format_version": FORMAT_VERSION,
+        "format_version": DRAWN_FORMAT_VERSION if _draws_factors(env) else FORMAT_VERSION,
         "env_id": env_id,
         "env_kwargs": env_kwargs,
         "observation_space": space_to_json(observation_space),
@@ -153,12 +154,15 @@ def collect_shard(
     reset_seed, action_seed = seed.spawn(2)
     actions = _random_actions(env.single_action_space, (n_steps, n_envs), np.random.default_rng(action_seed))
     observation, _ = env.reset(seed=reset_seed.generate_state(n_envs).tolist())
-    observations, factors = [observation], [_factors(env)]
+    # Frames that can be drawn again are not kept.
+    drawn = _draws_factors(env)
+    observations, factors = [] if drawn else [observation], [_factors(env)]
     # Per copy: (steps taken at the episode's end, how it ended, last frame, last factors).
     endings: list[list[_Ending]] = [[] for _ in range(n_envs)]
     for t in range(kept.max()):
         observation, _, terminated, truncated, infos = env.step(actions[t])
-        observations.append(observation)
+        if not drawn:
+            observations.append(observation)
         factors.append(_factors(env))
         for j in np.flatnonzero((terminated | truncated) & (t < kept)):
             last_factors = {name: infos["final_info"]["factors"][name][j] for name in factors[0]}
@@ -170,9 +174,10 @@ def collect_shard(
     for i, n in enumerate(kept.tolist()):
         begin = 0
         if n and (not endings[i] or endings[i][-1][0] < n):
-            endings[i].append((n, CUT, observations[n][i], {name: array[n, i] for name, array in states.items()}))
+            last_frame = None if drawn else observations[n][i]
+            endings[i].append((n, CUT, last_frame, {name: array[n, i] for name, array in states.items()}))
         for stop, end, last_frame, last in endings[i]:
-            frames = [observations[t][i] for t in range(begin, stop)] + [last_frame]
+            frames = None if drawn else [observations[t][i] for t in range(begin, stop)] + [last_frame]
             rows = {
                 name: np.concatenate([array[begin:stop, i], np.asarray(last[name], array.dtype)[None]])
                 for name, array in states.items()
@@ -182,7 +187,7 @@ def collect_shard(
     return segments
 
 
-_Ending = tuple[int, int, NDArray[np.uint8], dict[str, Any]]
+_Ending = tuple[int, int, NDArray[np.uint8] | None, dict[str, Any]]
 
 
 def make_vector_env(env_id: str, n_envs: int, env_kwargs: dict[str, Any]) -> VectorEnv[Any, Any, Any]:
@@ -219,6 +224,11 @@ def _factors(env: VectorEnv[Any, Any, Any]) -> dict[str, NDArray[Any]]:
     return unwrapped.factors() if isinstance(unwrapped, sb3_abisim.envs.base.BatchEnv) else {}
 
 
+def _draws_factors(env: VectorEnv[Any, Any, Any]) -> bool:
+    unwrapped = env.unwrapped
+    return isinstance(unwrapped, sb3_abisim.envs.base.BatchEnv) and unwrapped.draws_factors
+
+
 def _fingerprint(env: VectorEnv[Any, Any, Any]) -> str | None:
     copies = getattr(env.unwrapped, "envs", None)
     value = getattr(copies[0].unwrapped if copies else env.unwrapped, "fingerprint", None)
@@ -230,6 +240,8 @@ def _steps_per_shard(env: VectorEnv[Any, Any, Any], env_id: str, env_kwargs: dic
     spec = gym.registry[env_id]
     limit = int(env_kwargs.get("max_episode_steps") or spec.max_episode_steps or 1)
     row = math.prod(env.single_observation_space.shape or ())
+    if _draws_factors(env):
+        row = sum(array[0].nbytes for array in _factors(env).values())
     steps = max(1, min(SHARD_TRANSITIONS, MAX_SHARD_BYTES // row) // (env.num_envs * limit)) * limit
     if steps * env.num_envs * row > MAX_SHARD_BYTES:
         most = MAX_SHARD_BYTES // (limit * row)

@@ -6,7 +6,7 @@ the files that were read count as this process's memory until they are given bac
 
 import mmap
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +26,7 @@ from sb3_abisim.dataset_format import (
     array_layout,
     check_meta,
     from_json_file,
+    holds_frames,
     space_from_json,
 )
 
@@ -67,7 +68,8 @@ class TransitionDataset:
     :param holdout: share of the segments (episodes and cut episodes) that make up ``part="test"``, in [0, 1)
     :param verify: True compares every file with its sha256, False only sizes; None does so once per process for
         datasets below ``VERIFY_BELOW_BYTES``
-    :raises DatasetError: if the folder is not a finished dataset, or is damaged
+    :raises DatasetError: if the folder is not a finished dataset, or is damaged, or has no frames and the scenes that
+        they would be drawn from are not the same any more
     """
 
     def __init__(self, path: str | os.PathLike[str], holdout: float = 0.05, verify: bool | None = None) -> None:
@@ -84,6 +86,11 @@ class TransitionDataset:
         self.observation_space: spaces.Box = space_from_json(self.meta["observation_space"])  # type: ignore[assignment]
         self.action_space = space_from_json(self.meta["action_space"])
         self._check_files(verify)
+        self._draw: Callable[[dict[str, NDArray[Any]]], NDArray[np.uint8]] | None = None
+        if not holds_frames(self.meta):
+            from sb3_abisim.dataset_drawing import make_drawer
+
+            self._draw = make_drawer(self.path, self.meta)
         frames_per_shard = [shard["n_frames"] for shard in self.meta["shards"]]
         # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
         self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
@@ -149,7 +156,7 @@ class TransitionDataset:
         :return: uint8 [m, C, H, W], a copy
         :raises IndexError: for an index out of range
         """
-        return self._gather("frames", self._check_index(index))
+        return self._frames(self._check_index(index))
 
     def actions(self, index: Any) -> NDArray[Any]:
         """Actions taken at the given frames, int64 [m] or float32 [m, A]; zero at a segment's last frame.
@@ -163,8 +170,7 @@ class TransitionDataset:
 
         :param index: integers [m] in 0..n_frames - 1
         """
-        index = self._check_index(index)
-        return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
+        return self._factors(self._check_index(index))
 
     def batches(
         self,
@@ -207,7 +213,7 @@ class TransitionDataset:
             here = slice(i * batch_size, (i + 1) * batch_size)
             index = starts[here]
             # Both frames of a pair lie close together on disk: one gather reads each page once.
-            both = self._gather("frames", np.concatenate([index, index + steps[here]]))
+            both = self._frames(np.concatenate([index, index + steps[here]]))
             taken = index[:, None] + np.arange(steps[0]) if sequences else index
             yield TransitionBatch(both[:batch_size], self._actions[taken], both[batch_size:])
 
@@ -219,6 +225,12 @@ class TransitionDataset:
         if bad.size:
             raise IndexError(f"frame index {bad[0]} is out of range, the dataset has {self.n_frames} frames")
         return array.astype(np.int64)
+
+    def _frames(self, index: NDArray[np.int64]) -> NDArray[np.uint8]:
+        return self._gather("frames", index) if self._draw is None else self._draw(self._factors(index))
+
+    def _factors(self, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
 
     def _gather(self, name: str, index: NDArray[np.int64]) -> NDArray[Any]:
         dtype, row_shape = array_layout(self.meta, name)

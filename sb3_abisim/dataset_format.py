@@ -8,6 +8,9 @@
     shard-00000.json     sizes and hashes of the shard's files, written after them
     meta.json            everything above in one document, written last: without it the dataset is unfinished
 
+In the format of version 2 there are no frames: they are drawn from the factors when they are read, by the environment
+that env_id and env_kwargs name, whose fingerprint must be the same. All else is as in version 1.
+
 A segment is an episode, or the part of one that a shard's end cuts off. All documents are free of times and host names,
 so that the same command writes the same bytes.
 """
@@ -24,6 +27,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 FORMAT_VERSION = 1
+# Without frames, for environments that can draw them from the factors.
+DRAWN_FORMAT_VERSION = 2
 CONFIG_NAME = "config.json"
 META_NAME = "meta.json"
 # Values of the ends array.
@@ -56,7 +61,16 @@ def array_names(identity: dict[str, Any]) -> tuple[str, ...]:
 
     :param identity: a document with the keys ``IDENTITY_KEYS``, such as config.json or meta.json
     """
-    return "frames", "actions", "ends", *(f"factor_{name}" for name in identity["factors"])
+    frames = ("frames",) if holds_frames(identity) else ()
+    return *frames, "actions", "ends", *(f"factor_{name}" for name in identity["factors"])
+
+
+def holds_frames(identity: dict[str, Any]) -> bool:
+    """Whether the shards hold frames; if not, they are drawn from the factors.
+
+    :param identity: as for :func:`array_names`
+    """
+    return bool(identity["format_version"] == FORMAT_VERSION)
 
 
 def array_file(name: str, shard: int) -> str:
@@ -256,8 +270,9 @@ def check_meta(meta: dict[str, Any]) -> None:
     :param meta: the content of meta.json
     :raises ValueError: with the reason
     """
-    if meta.get("format_version") != FORMAT_VERSION:
-        raise ValueError(f"format version {meta.get('format_version')!r}, this version reads {FORMAT_VERSION}")
+    known = FORMAT_VERSION, DRAWN_FORMAT_VERSION
+    if meta.get("format_version") not in known:
+        raise ValueError(f"format version {meta.get('format_version')!r}, this version reads {known}")
     if set(meta) != {*IDENTITY_KEYS, "versions", "n_transitions", "n_frames", "shards", "digest", "checksum"}:
         raise ValueError("its keys are not those of a dataset")
     check_factor_layout(meta["factors"])

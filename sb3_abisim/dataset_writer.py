@@ -37,13 +37,13 @@ _PACKAGES = ("gymnasium", "gymnasium-robotics", "mujoco", "numpy")
 class Segment:
     """An episode, or the part of one that fell into a shard: L transitions between L + 1 frames.
 
-    :param frames: L + 1 arrays of uint8 [C, H, W], or one array of them
+    :param frames: L + 1 arrays of uint8 [C, H, W], or one array of them; None where frames are drawn from the factors
     :param actions: [L, ...]
     :param end: TERMINATED, TRUNCATED or CUT
     :param factors: name to L + 1 rows
     """
 
-    frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8]
+    frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8] | None
     actions: NDArray[Any]
     end: int
     factors: dict[str, Any] = field(default_factory=dict)

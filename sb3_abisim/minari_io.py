@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sb3_abisim.dataset import TransitionDataset
 from sb3_abisim.dataset_format import (
     CUT,
+    DRAWN_FORMAT_VERSION,
     FORMAT_VERSION,
     IDENTITY_KEYS,
     TERMINATED,
@@ -212,7 +213,7 @@ def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[s
         if (
             not isinstance(ours, dict)
             or not set(IDENTITY_KEYS) <= ours.keys()
-            or ours["format_version"] != FORMAT_VERSION
+            or ours["format_version"] not in (FORMAT_VERSION, DRAWN_FORMAT_VERSION)
         ):
             raise ValueError(f"Minari dataset {dataset_id} was exported by another version of sb3_abisim")
         check_factor_layout(ours["factors"])

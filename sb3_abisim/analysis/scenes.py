@@ -10,6 +10,7 @@ from sb3_abisim.analysis.nav2d_exact import HELD_OUT_SEED
 from sb3_abisim.collect import collect_shard, make_vector_env
 from sb3_abisim.envs import point_maze, top_down
 from sb3_abisim.envs.backgrounds import composite
+from sb3_abisim.envs.base import BatchEnv
 from sb3_abisim.envs.nav2d import SIZE
 from sb3_abisim.envs.point_maze import PIXELS_PER_METRE, ROOM_SIZE, to_pixels
 
@@ -56,6 +57,9 @@ def sample_episodes(
     if n_episodes < 1:
         raise ValueError(f"the number of episodes must be at least 1, got {n_episodes}")
     env = make_vector_env(env_id, min(N_COPIES, n_episodes), env_kwargs or {})
+    batch = env.unwrapped
+    # Segments of such environments come without frames.
+    draw = batch.draw if isinstance(batch, BatchEnv) and batch.draws_factors else None
     limit = env.spec.max_episode_steps if env.spec is not None else None
     assert limit is not None, "ours have a time limit"
     sequence = np.random.SeedSequence([HELD_OUT_SEED, seed])
@@ -68,7 +72,12 @@ def sample_episodes(
             length = len(segment.actions)
             for t in np.sort(generator.permutation(length)[:per_episode]).tolist():
                 state = {name: array[t] for name, array in segment.factors.items()}
-                rows.append((segment.frames[t], segment.actions[t], segment.frames[t + 1], state, n))
+                if draw is None:
+                    assert segment.frames is not None
+                    now, later = segment.frames[t], segment.frames[t + 1]
+                else:
+                    now, later = draw({name: array[t : t + 2] for name, array in segment.factors.items()})
+                rows.append((now, segment.actions[t], later, state, n))
             n += 1
     env.close()
     frames, actions, next_frames, states, episodes = zip(*rows, strict=True)

@@ -36,6 +36,8 @@ class BatchEnv(gym.vector.VectorEnv):
         "render_fps": 10,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
+    # Whether :meth:`draw` is there: datasets then hold the factors alone and draw their frames when they are read.
+    draws_factors: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -113,6 +115,15 @@ class BatchEnv(gym.vector.VectorEnv):
         """The simulator's state behind the current observations, for probes; no loss may read it.
 
         :return: name to array of shape (num_envs, ...), copies
+        """
+        raise NotImplementedError
+
+    def draw(self, factors: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+        """The frames that belong to factors, equal to the bit to the observations at that time; changes nothing.
+
+        :param factors: name to array of shape (n, ...), as of :meth:`factors`, at any time and in any copies
+        :return: (n, *observation shape)
+        :raises ValueError: for factors that this environment cannot have
         """
         raise NotImplementedError
 

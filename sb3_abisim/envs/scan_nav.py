@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sb3_abisim.envs.base import BatchEnv, SingleEnv
 from sb3_abisim.envs.scan_map import ScanMap
 from sb3_abisim.envs.scan_view import MARKER_RADIUS, MARKERS, MarkerPainter, SceneView
-from sb3_abisim.envs.scan_world import ScanWorld, StartRule
+from sb3_abisim.envs.scan_world import NODE, ScanWorld, StartRule
 from sb3_abisim.envs.top_down import enlarge
 
 OBS_MODES = ("rgbd", "dict", "rgb")
@@ -75,6 +75,8 @@ class ScanNavVectorEnv(BatchEnv):
     :raises ValueError: for settings out of range
     """
 
+    draws_factors = True
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -132,9 +134,9 @@ class ScanNavVectorEnv(BatchEnv):
         self._views = [SceneView(scan, image_size, view_size) for scan in self.scans]
         self._painter = MarkerPainter(marker, image_size, self._pitch)
         # The marker and a pixel stay inside the picture.
-        reach = view_size / 2 - MARKER_RADIUS - 2 * self._pitch
+        self._reach = view_size / 2 - MARKER_RADIUS - 2 * self._pitch
         rule = StartRule(min_geodesic, max_geodesic, min_ratio)
-        self._world = ScanWorld(self.scans, self._pitch, reach, goals_per_scene, num_envs, rule)
+        self._world = ScanWorld(self.scans, self._pitch, self._reach, goals_per_scene, num_envs, rule)
         self._options: dict[str, Any] = {}
         self._scene = np.zeros(num_envs, dtype=np.int64)
         self._field = np.zeros(num_envs, dtype=np.int64)
@@ -265,16 +267,47 @@ class ScanNavVectorEnv(BatchEnv):
     # Pictures.
 
     def _observe(self, indices: NDArray[np.int64]) -> Any:
+        scenes, fields = self._scene[indices], self._field[indices]
+        goals = self._world.goal_positions(scenes, fields)
+        # Not simply the position: the factors hold the sum, and frames drawn from them must not differ by a rounding.
+        offsets = (goals + self._position[indices]) - goals
+        return self._picture(scenes, self._world.corners[fields], offsets, self._heading[indices])
+
+    def draw(self, factors: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+        """See :meth:`BatchEnv.draw`.
+
+        :param factors: ``agent``, ``goal``, ``heading`` and ``scene``, see the class
+        """
+        scenes, offsets = factors["scene"], factors["agent"] - factors["goal"]
+        # Written so that NaN counts as outside.
+        if not (((scenes >= 0) & (scenes < len(self.scans))).all() and (abs(offsets) <= self._reach + NODE).all()):
+            raise ValueError(
+                "factors with a scene that is not there, or an agent outside the view: not of this setting"
+            )
+        corners = self._world.corners_at(scenes, factors["goal"])
+        sizes = np.array([scan.rgbd.shape[1:] for scan in self._views])[scenes] - self.image_size
+        if not ((corners >= 0) & (corners <= sizes)).all():
+            raise ValueError("factors with a goal outside its scene: not of this setting")
+        frames: NDArray[np.uint8] = self._picture(scenes, corners, offsets, factors["heading"])
+        return frames
+
+    def _picture(
+        self,
+        scenes: NDArray[np.int64],
+        corners: NDArray[np.int64],
+        offsets: NDArray[np.float64],
+        headings: NDArray[np.float64],
+    ) -> Any:
+        """Observations with the goals at these corners of pixels and the agents this far from them."""
         n = self.image_size
-        frames = np.empty((len(indices), 3 if self.obs_mode == "rgb" else 4, n, n), dtype=np.uint8)
-        corners = self._world.corners[self._field[indices]].tolist()
-        for frame, scene, (row, column) in zip(frames, self._scene[indices].tolist(), corners, strict=True):
+        frames = np.empty((len(scenes), 3 if self.obs_mode == "rgb" else 4, n, n), dtype=np.uint8)
+        views = list(zip(scenes.tolist(), corners.tolist(), strict=True))
+        for frame, (scene, (row, column)) in zip(frames, views, strict=True):
             frame[:] = self._views[scene].rgbd[: len(frame), row : row + n, column : column + n]
-        centres = n / 2 + self._position[indices] * (1 / self._pitch, -1 / self._pitch)
-        self._painter.draw(frames, centres, self._heading[indices])
+        centres = n / 2 + offsets * (1 / self._pitch, -1 / self._pitch)
+        self._painter.draw(frames, centres, headings)
         if self.obs_mode != "dict":
             return frames
-        views = zip(self._scene[indices].tolist(), corners, strict=True)
         depth = [self._views[scene].depth[row : row + n, column : column + n] for scene, (row, column) in views]
         return {"rgb": np.ascontiguousarray(frames[:, :3].transpose(0, 2, 3, 1)), "depth": np.stack(depth)[..., None]}
 

@@ -181,8 +181,7 @@ class ScanWorld:
         :param goal: x and y in m, in the scan's coordinates; moved to the nearest corner of a pixel
         :raises ValueError: where one cannot walk there
         """
-        offset = (goal - self._origins[scene]) * (1, -1) / self.pitch
-        corner = np.rint(offset).astype(np.int64)[::-1]
+        corner = self.corners_at(np.array([scene]), goal[None])[0]
         distances = self._compute(scene, corner)
         if not np.isfinite(distances[self._middle, self._middle]):
             raise ValueError(f"the goal {goal.tolist()} is not on the walkable floor of {self.scans[scene].source}")
@@ -196,6 +195,16 @@ class ScanWorld:
         """
         places: NDArray[np.float64] = self._origins[scenes] + self.corners[fields][:, ::-1] * (self.pitch, -self.pitch)
         return places
+
+    def corners_at(self, scenes: NDArray[np.int64], points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The corners of pixels nearest to points, the inverse of :meth:`goal_positions`: rows and columns, (n, 2).
+
+        :param scenes: index of each
+        :param points: x and y in m, in the scans' coordinates, (n, 2)
+        """
+        offsets = (points - self._origins[scenes]) * (1, -1) / self.pitch
+        corners: NDArray[np.int64] = np.rint(offsets).astype(np.int64)[:, ::-1]
+        return corners
 
     def _compute(self, scene: int, corner: NDArray[np.int64]) -> NDArray[np.float32]:
         scan, offsets = self.scans[scene], np.arange(-self.half, self.half + 1) * NODE
