@@ -16,6 +16,7 @@ from torch import nn
 from zoo_inputs import SMALL, write_encoder
 
 from sb3_abisim import frozen, zoo
+from sb3_abisim.benchmark.evaluate import evaluate_final
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.vec_env import VecEncodeObservations
 
@@ -96,6 +97,7 @@ def test_a_frozen_run_acts_on_the_encoder_it_was_trained_on(
     encoding = unwrap_vec_wrapper(seen[0], VecEncodeObservations)
     assert encoding is not None and encoding.encoder_file.digest == digest
     folder = tmp_path / "moved" / "ppo" / "Nav2D-v0_1"
+    assert np.load(evaluate_final(folder, 2))["sampled/standard/results"].shape == (2,)
     frozen.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-o", str(tmp_path / "fused.zip")])
     model = PPO.load(tmp_path / "fused.zip", device="cpu")
     assert model.policy.features_extractor.digest == digest

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark.runs import read_run
+from sb3_abisim.checkpoint import RUN_COPY
+from sb3_abisim.frozen import fuse
+from sb3_abisim.vec_env import EncodedBox
 from sb3_abisim.zoo import DISTRACTOR_IDS
 
 FILE_NAME = "final_evaluations.npz"
@@ -45,6 +48,9 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
     if not model_path.is_file():
         raise ValueError(f"{run.folder} holds no final model ({model_path.name}); let the run end first")
     model = ALGOS[run.algo].load(model_path, device="cpu")
+    if isinstance(model.observation_space, EncodedBox):
+        # Trained on embeddings, and the environments here show pictures.
+        model = fuse(model, str(run.folder / run.env_id / RUN_COPY))
     arrays: dict[str, NDArray[Any]] = {}
     for split in SPLITS if run.env_id in DISTRACTOR_IDS else (None,):
         for mode in MODES:
