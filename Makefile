@@ -53,9 +53,10 @@ figures: setup  ## draw every figure of docs/figures.md anew from the committed 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
 	$(BIN)/python -m sb3_abisim.benchmark -o benchmark
 
-# Budgets that show that the machinery works, and nothing about the methods.
-SMOKE := --env Nav2D-v0 DistractorPointMaze-v0 --methods abisim ssi vanilla --seeds 0 1 --n-transitions 2000 \
-	-n 1024 --eval-freq 256 --eval-episodes 3 --n-eval-envs 3 --final-episodes 4 --device cpu \
+# Budgets that show that the machinery works, and nothing about the methods. Of each thing the least that gives every part
+# of the report: two runs for intervals, one encoder for both (on the SSI encoder that it starts from), a baseline, clips.
+SMOKE := --env Nav2D-v0 DistractorPointMaze-v0 --methods abisim vanilla --seeds 0 1 --encoder-seeds 0 \
+	--n-transitions 2000 -n 1024 --eval-freq 256 --eval-episodes 3 --n-eval-envs 3 --final-episodes 4 --device cpu \
 	--pretrain-params n_updates:20 log_interval:10 checkpoint_interval:10 batch_size:64 \
 	--params dqn.learning_starts:100 ppo.n_envs:4 ppo.n_steps:64 ppo.batch_size:64 ppo.n_epochs:2
 

@@ -1,5 +1,6 @@
 """The command as a user types it."""
 
+import csv
 import importlib.util
 import json
 import os
@@ -78,6 +79,28 @@ def test_what_the_report_needs_is_said_before_the_work(
         main(["-o", str(tmp_path / "new")])
     assert "rliable not installed; run: pip install 'sb3_abisim[benchmark]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_the_whole_graph_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Collect, pretrain, train, evaluate, report, export: each as small as it can be."""
+    # Of words that are given twice, the later one holds.
+    words = [word for word in SMALL if word != "--no-report"]
+    main(["-o", str(tmp_path / "b"), *words, "-n", "400", "--eval-freq", "200", "--final-episodes", "2"])
+    err = capsys.readouterr().err
+    assert "4 of 4 cells done, 0 of them before; 0 failed" in err and "warning" not in err
+    report = tmp_path / "b" / "report"
+    assert {path.name for path in report.iterdir()} == {"index.html", "curves.png", "curves.csv", "final.csv"}
+    with open(report / "final.csv", newline="") as file:
+        kinds = [(row["method"], row["mode"], row["split"], row["paper"]) for row in csv.DictReader(file)]
+    assert kinds == [("ssi", "deterministic", "standard", "-12.613"), ("ssi", "sampled", "standard", "")]
+    main(["export", str(tmp_path / "b"), "-o", str(tmp_path / "copy")])
+    main(["report", str(tmp_path / "copy")])
+    for path in report.iterdir():
+        # The page shows commands, of which the interpreter's folder does not enter the copy.
+        expected = path.read_bytes().replace(f"{Path(sys.executable).parent}/".encode(), b"")
+        assert (tmp_path / "copy" / "report" / path.name).read_bytes() == expected, path.name
+    texts = [path.read_text() for path in (tmp_path / "copy").rglob("*") if path.suffix in (".yml", ".txt", ".json")]
+    assert len(texts) == 3 + 4 + 1 and not any(str(tmp_path) in text for text in texts)
 
 
 @pytest.mark.slow

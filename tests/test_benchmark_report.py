@@ -15,6 +15,7 @@ from PIL import Image
 from sb3_abisim.benchmark import statistics
 from sb3_abisim.benchmark.__main__ import main
 from sb3_abisim.benchmark.comparison import compare
+from sb3_abisim.benchmark.figures import MINUS
 from sb3_abisim.benchmark.report import report
 from sb3_abisim.benchmark.runs import find_runs, read_run
 
@@ -144,7 +145,9 @@ def test_page_needs_no_other_file_and_says_how_it_was_evaluated(made: Path) -> N
     assert "Evaluation is deterministic" in text and f"mean of {N_EPISODES} episodes" in text
     assert "python -m sb3_abisim.zoo train --seed 1" in text
     assert "0.61 times the steps of ssi" in text
-    assert "To the return that vanilla ends with (-73.33) ≤ 0.37 times the steps of vanilla" in text
+    assert f"To where vanilla ends, {MINUS}73.33, abisim needs ≤ 0.37 times the steps of vanilla: fewer" in text
+    assert f"No run of any method reached {MINUS}12.8 in PointMaze-v0." in text and "none arrived" not in text
+    assert "near the lowest" not in text
     for name in ("curves", "thresholds", "splits", "aggregates", "profiles", "improvement"):
         with Image.open(made / f"{name}.png") as picture:
             assert len(picture.convert("RGB").getcolors(1 << 24)) > 10, name
@@ -176,6 +179,15 @@ def test_training_episodes_as_source(tmp_path: Path) -> None:
     assert "No aggregates across environments" in text
 
 
+def test_an_end_where_nothing_was_learnt_is_said_to_be_one(tmp_path: Path) -> None:
+    for method, value in (("abisim", -40.0), ("vanilla", -127.0)):
+        write_run(tmp_path, "PointMaze-v0", method, 0, STEPS, np.full((len(STEPS), 1), value))
+    assert any(
+        note.startswith("PointMaze-v0: vanilla ends near the lowest return (-127)")
+        for note in compare([str(tmp_path)]).notes
+    )
+
+
 def test_reference_is_the_first_method_where_ours_is_not_there(logs: Path) -> None:
     folders = [str(logs / "vanilla"), str(logs / "ssi")]
     assert compare(folders).reference == "vanilla" and compare([*folders, str(logs / "abisim")]).reference == "abisim"
@@ -187,6 +199,13 @@ def test_labels(tmp_path: Path) -> None:
     assert sorted(run.label for run in find_runs(tmp_path)) == ["abisim", "abisim,frozen", "vanilla"]
     groups = compare([f"mine={tmp_path / 'ppo' / 'PointMaze-v0_1'}"], "evaluations", "mine", [0.5]).groups
     assert list(groups["PointMaze-v0"]) == ["mine"]
+
+
+def test_what_a_benchmark_works_on_is_no_run_yet(tmp_path: Path) -> None:
+    returns = np.zeros((len(STEPS), 1))
+    write_run(tmp_path / "work" / "run-0123456789abcdef", "PointMaze-v0", "ssi", 0, STEPS, returns)
+    write_run(tmp_path / "runs", "PointMaze-v0", "ssi", 1, STEPS, returns)
+    assert [run.seed for run in find_runs(tmp_path)] == [1]
 
 
 def test_a_benchmarks_folder_is_read_by_its_index(tmp_path: Path) -> None:

@@ -28,6 +28,8 @@ PAPER = {
 PROFILE_TAUS = np.linspace(0.0, 1.0, 101)
 # Shares of the way to the best return, and the return that a method ends with.
 DEFAULT_THRESHOLDS: tuple[float | str, ...] = (0.5, 0.7, 0.9)
+# As a share of the way to the best return: what is reached there says nothing.
+NEAR_THE_LOWEST = 0.05
 DEFAULT_REFERENCE, FROM_SCRATCH = "abisim", "vanilla"
 Row = dict[str, Any]
 
@@ -133,7 +135,7 @@ def compare(
     aggregates, profiles, improvement = _across(groups, labels, reference, seed, notes)
     return Comparison(
         groups, reference, source, _curve_rows(groups), _final_rows(groups),
-        _threshold_rows(groups, reference, thresholds, seed), aggregates, profiles, improvement, notes,
+        _threshold_rows(groups, reference, thresholds, seed, notes), aggregates, profiles, improvement, notes,
     )  # fmt: skip
 
 
@@ -242,7 +244,7 @@ def _final_rows(groups: dict[str, dict[str, Group]]) -> list[Row]:
 
 
 def _threshold_rows(
-    groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float | str], seed: int
+    groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float | str], seed: int, notes: list[str]
 ) -> list[Row]:
     rows = []
     for env_id, methods in groups.items():
@@ -254,6 +256,10 @@ def _threshold_rows(
                 if threshold not in methods:
                     continue
                 level = methods[threshold].end()
+                if methods[threshold].normalised(level) < NEAR_THE_LOWEST:
+                    notes.append(
+                        f"{env_id}: {threshold} ends near the lowest return ({level:.4g}), which takes little to reach."
+                    )
             else:
                 first = methods[reference]
                 level = first.low + threshold * (first.high - first.low)

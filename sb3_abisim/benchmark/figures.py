@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_abisim.benchmark.comparison import Comparison, Row
+from sb3_abisim.benchmark.comparison import Comparison, Group, Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F")
 GREY = "#6b7280"
 DPI = 150
+MINUS = "\N{MINUS SIGN}"
 SPLIT_NAMES = {"eval": "unseen clips", "train": "clips seen in training", "clean": "no clips"}
 _STYLE: Any = {
     "font.size": 10,
@@ -34,6 +35,14 @@ _STYLE: Any = {
     "legend.frameon": False,
     "figure.constrained_layout.use": True,
 }
+
+
+def level_text(value: float) -> str:
+    """A return as a reader sees it.
+
+    :param value: four digits of it are enough
+    """
+    return f"{value:.4g}".replace("-", MINUS)
 
 
 def draw(comparison: Comparison) -> dict[str, bytes]:
@@ -80,9 +89,7 @@ def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
             width = 2.4 if label == comparison.reference else 1.6
             axis.plot(steps, mean, color=colours[label], lw=width, label=label, marker="o" if len(steps) == 1 else None)
             axis.fill_between(steps, low, high, color=colours[label], alpha=0.18, lw=0)
-        group = next(iter(methods.values()))
-        if group.high == 0:
-            axis.set_ylim(group.low * 1.02, 1)
+        _show_possible(axis, next(iter(methods.values())))
         axis.set(title=env_id, xlabel="environment steps")
         axis.xaxis.set_major_formatter(_short_number)
         axis.locator_params(axis="x", nbins=5)
@@ -90,6 +97,12 @@ def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
     handles = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     figure.legend([handles[name] for name in colours], list(colours), loc="outside lower center", ncols=len(colours))
     return figure
+
+
+def _show_possible(axis: "Axes", group: Group) -> None:
+    """Cut intervals where returns end: Student's t knows of no bounds."""
+    if group.high == 0:
+        axis.set_ylim(group.low * 1.02, 1)
 
 
 def _short_number(value: float, _: int = 0) -> str:
@@ -116,7 +129,9 @@ def _thresholds(comparison: Comparison, colours: dict[str, str]) -> "Figure | No
             _interval(axis, y, row["ratio"], row["low"], row["high"], colours[row["baseline"]], row["bound"])
         axis.axvline(1, color=GREY, lw=1)
         ends = [" (its end)" if row["threshold"] == row["baseline"] else "" for row in shown]
-        names = [f"{row['baseline']}, return {row['return']:.4g}{end}" for row, end in zip(shown, ends, strict=True)]
+        names = [
+            f"{row['baseline']}, return {level_text(row['return'])}{end}" for row, end in zip(shown, ends, strict=True)
+        ]
         axis.set_yticks(range(len(shown)), names)
         axis.set_xscale("log")
         axis.set_xlim(*_log_limits([row[key] for row in shown for key in ("ratio", "low", "high")]))
@@ -163,6 +178,7 @@ def _splits(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
             axis.axvline(line, color="#e5e7eb", lw=1)
         axis.set_xticks(range(3), list(SPLIT_NAMES.values()))
         axis.set(title=env_id, ylabel="return of the final model", xlim=(-0.5, 2.5))
+        _show_possible(axis, comparison.groups[env_id][labels[0]])
         axis.grid(axis="x", visible=False)
         axis.legend(loc="best")
     return figure
@@ -214,6 +230,8 @@ def _profiles(comparison: Comparison, colours: dict[str, str]) -> "Figure | None
         columns: list[Any] = [[row[key] for row in rows] for key in ("score", "share", "low", "high")]
         axis.plot(columns[0], columns[1], color=colour, lw=2, label=label)
         axis.fill_between(columns[0], columns[2], columns[3], color=colour, alpha=0.18, lw=0)
-    axis.set(xlabel="normalised return of the final model", ylabel="share of runs above it", xlim=(0, 1))
-    axis.legend(*(reversed(part) for part in axis.get_legend_handles_labels()), loc="lower left")
+    axis.set(
+        xlabel="normalised return of the final model", ylabel="share of runs above it", xlim=(0, 1), ylim=(-0.02, 1.02)
+    )
+    axis.legend(*(reversed(part) for part in axis.get_legend_handles_labels()), loc="upper right")
     return figure

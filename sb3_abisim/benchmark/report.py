@@ -13,7 +13,7 @@ from sb3_abisim._version import __version__
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark import statistics
 from sb3_abisim.benchmark.comparison import Comparison, Row, compare
-from sb3_abisim.benchmark.figures import SPLIT_NAMES, draw
+from sb3_abisim.benchmark.figures import MINUS, SPLIT_NAMES, draw, level_text
 from sb3_abisim.benchmark.runs import Run, is_deterministic
 from sb3_abisim.zoo import DISTRACTOR_IDS
 
@@ -83,14 +83,24 @@ def render(comparison: Comparison, pictures: dict[str, bytes]) -> str:
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters |= {"number": _number, "place": _place, "plus_minus": _plus_minus, "ratio": _ratio}
+    environment.filters |= {
+        "number": _number,
+        "level": level_text,
+        "place": _place,
+        "plus_minus": _plus_minus,
+        "ratio": _ratio,
+    }
     template = environment.from_string(resources.files(__package__).joinpath("report.html").read_text(encoding="utf-8"))
     images = {name: f"data:image/png;base64,{base64.b64encode(data).decode()}" for name, data in pictures.items()}
     labels = list(dict.fromkeys(label for methods in comparison.groups.values() for label in methods))
+    unreached = _unreached(comparison)
+    unreached_keys = {(row["env_id"], row["threshold"]) for row in unreached}
     return template.render(
         comparison=comparison,
         images=images,
         cards=[_card(comparison, env_id) for env_id in comparison.groups],
+        thresholds=[row for row in comparison.thresholds if (row["env_id"], row["threshold"]) not in unreached_keys],
+        unreached=unreached,
         final=_final_table(comparison),
         splits=_split_table(comparison),
         split_names=SPLIT_NAMES,
@@ -131,20 +141,35 @@ def _groups(comparison: Comparison) -> list[tuple[str, Any]]:
 
 
 def _card(comparison: Comparison, env_id: str) -> dict[str, Any]:
-    """What a reader in a hurry takes away: the highest return that all runs of the reference reached, against each
-    baseline; and the return that a baseline ends with, against that baseline."""
+    """What a reader in a hurry takes away: how soon the reference is where a baseline ends, and how soon it reaches the
+    highest return that all its runs reached, against each baseline."""
     rows = [row for row in comparison.thresholds if row["env_id"] == env_id]
     always = [row for row in rows if row["reached_reference"] == row["n_reference"]]
-    highest = max((row["return"] for row in always), default=None)
-    ends = [row for row in rows if row["threshold"] == row["baseline"]]
+    parts = {row["threshold"]: [row] for row in rows if row["threshold"] == row["baseline"]}
+    if always:
+        highest = max(always, key=lambda row: row["return"])["threshold"]
+        parts[highest] = [row for row in always if row["threshold"] == highest]
     counts = {len(group.runs) for group in comparison.groups[env_id].values()}
     return {
         "env_id": env_id,
         "n_runs": f"{min(counts)} to {max(counts)}" if len(counts) > 1 else str(min(counts)),
-        "level": highest,
-        "lines": [_sentence(row) for row in always if row["return"] == highest],
-        "ends": [{"baseline": row["baseline"], "level": row["return"], "line": _sentence(row)} for row in ends],
+        "parts": [
+            {
+                "ends": threshold if isinstance(threshold, str) else "",
+                "level": found[0]["return"],
+                "lines": [_sentence(row) for row in found],
+            }
+            for threshold, found in parts.items()
+        ],
     }
+
+
+def _unreached(comparison: Comparison) -> list[Row]:
+    """One row for each environment and threshold at which no run of any method arrived."""
+    rows: dict[tuple[str, Any], list[Row]] = {}
+    for row in comparison.thresholds:
+        rows.setdefault((row["env_id"], row["threshold"]), []).append(row)
+    return [found[0] for found in rows.values() if not any(math.isfinite(row["ratio"]) for row in found)]
 
 
 def _sentence(row: Row) -> str:
@@ -201,7 +226,7 @@ def _plus_minus(pair: tuple[float, float] | None) -> str:
         return ""
     mean, half = pair
     text = f"{mean:.1f} ± {half:.1f}" if math.isfinite(half) else f"{mean:.1f}"
-    return text.replace("-", "\N{MINUS SIGN}")
+    return text.replace("-", MINUS)
 
 
 def _ratio(row: Row) -> str:
