@@ -51,7 +51,7 @@ def straightforward(run: Any) -> Iterator[float]:
     optimizer = th.optim.Adam([p for p in module.parameters() if p.requires_grad], lr=1e-3)
     while True:
         for now, later, taken in th.utils.data.DataLoader(Transitions(), BATCH_SIZE, shuffle=True, drop_last=True):
-            loss, _ = module.loss(TensorBatch(now, taken, later))
+            loss, _ = module.loss(TensorBatch.of(now, taken, later))
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
