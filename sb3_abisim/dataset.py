@@ -49,14 +49,26 @@ Steps = int | tuple[int, int] | list[int]
 class TransitionBatch:
     """B transitions in shuffled order.
 
-    :param observations: s_t, uint8 [B, C, H, W], in 0..255
+    :param frames: uint8 [m, C, H, W], in 0..255; those that several transitions share stand once
     :param actions: a_t, int64 [B] or float32 [B, A]; as sequences a_t to a_{t+k-1}, int64 [B, k] or float32 [B, k, A]
-    :param next_observations: s_{t+k}, uint8 [B, C, H, W]
+    :param now: where s_t stands among the frames, int64 [B] or a slice
+    :param later: where s_{t+k} stands among them
     """
 
-    observations: NDArray[np.uint8]
+    frames: NDArray[np.uint8]
     actions: NDArray[Any]
-    next_observations: NDArray[np.uint8]
+    now: Any
+    later: Any
+
+    @property
+    def observations(self) -> NDArray[np.uint8]:
+        """s_t, uint8 [B, C, H, W], in 0..255."""
+        return self.frames[self.now]
+
+    @property
+    def next_observations(self) -> NDArray[np.uint8]:
+        """s_{t+k}, uint8 [B, C, H, W]."""
+        return self.frames[self.later]
 
 
 class TransitionDataset:
@@ -181,10 +193,15 @@ class TransitionDataset:
         start: int = 0,
         part: Part | None = None,
         sequences: bool = False,
+        run_length: int = 1,
     ) -> Iterator[TransitionBatch]:
         """One shuffled pass over all :meth:`pairs`; the last, incomplete batch is dropped.
 
         The order is a function of (seed, epoch) alone, so that a position in training is two integers.
+
+        With ``run_length`` above 1, runs of transitions that follow each other in an episode are shuffled instead of
+        single ones. A frame then ends one transition and begins the next, so that little more than half as many have to
+        be read and embedded. Where episodes are cut into runs is drawn anew for each pass.
 
         :param batch_size: transitions per batch
         :param k: steps between the two observations, or the fewest and the most of them
@@ -193,29 +210,53 @@ class TransitionDataset:
         :param start: batches to skip
         :param part: see :meth:`valid_starts`
         :param sequences: whether actions are all k between the two frames, instead of the first
+        :param run_length: transitions per run, at least 1; with a range of steps, frames that transitions start from
         :raises ValueError: if there are fewer transitions than one batch takes
         """
         if sequences and not isinstance(k, int):
             raise ValueError(f"sequences of actions need one length, got k = {k}; give one number")
-        if batch_size < 1 or start < 0:
-            raise ValueError(f"batch_size must be at least 1 and start at least 0, got {batch_size} and {start}")
+        for name, value, least in (("batch_size", batch_size, 1), ("run_length", run_length, 1), ("start", start, 0)):
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
         starts, steps = self.pairs(k, part)
         if len(starts) < batch_size:
             raise ValueError(f"batch_size {batch_size} exceeds the {len(starts)} transitions of {k} steps; lower it")
         # Drawn now and not at the first batch, so that mistakes raise here.
-        order = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch]))).permutation(len(starts))
-        return self._iterate(starts[order], steps[order], batch_size, start, sequences)
+        generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch])))
+        order = generator.permutation(len(starts)) if run_length == 1 else self._shuffle(starts, run_length, generator)
+        return self._iterate(starts[order], steps[order], batch_size, start, sequences, run_length > 1)
+
+    def _shuffle(self, starts: NDArray[np.int64], run_length: int, generator: np.random.Generator) -> NDArray[np.int64]:
+        """An order of transitions in which those of a run stay together."""
+        lengths = np.diff(self._last, prepend=-1)
+        # Each segment is cut at multiples of run_length, counted from a place before its beginning.
+        before = generator.integers(run_length, size=len(lengths))
+        position = np.arange(self.n_frames) - np.repeat(self._last + 1 - lengths - before, lengths)
+        begins = (position % run_length == 0) | (np.roll(self._ends, 1) != INSIDE)
+        run = np.cumsum(begins)[starts]
+        return np.argsort(generator.permutation(run.max() + 1)[run], kind="stable")
 
     def _iterate(
-        self, starts: NDArray[np.int64], steps: NDArray[np.int64], batch_size: int, start: int, sequences: bool
+        self,
+        starts: NDArray[np.int64],
+        steps: NDArray[np.int64],
+        batch_size: int,
+        start: int,
+        sequences: bool,
+        shared: bool,
     ) -> Iterator[TransitionBatch]:
         for i in range(start, len(starts) // batch_size):
             here = slice(i * batch_size, (i + 1) * batch_size)
             index = starts[here]
             # Both frames of a pair lie close together on disk: one gather reads each page once.
-            both = self._frames(np.concatenate([index, index + steps[here]]))
+            both = np.concatenate([index, index + steps[here]])
+            now: Any = slice(None, batch_size)
+            later: Any = slice(batch_size, None)
+            if shared:
+                both, places = np.unique(both, return_inverse=True)
+                now, later = places[now], places[later]
             taken = index[:, None] + np.arange(steps[0]) if sequences else index
-            yield TransitionBatch(both[:batch_size], self._actions[taken], both[batch_size:])
+            yield TransitionBatch(self._frames(both), self._actions[taken], now, later)
 
     def _check_index(self, index: Any) -> NDArray[np.int64]:
         array = np.asarray(index)

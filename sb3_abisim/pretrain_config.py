@@ -20,6 +20,8 @@ class PretrainConfig:
         the zoo's files
     :param k: steps between the two observations of a transition; ``[fewest, most]`` takes all pairs of observations
         with a number of steps in this range
+    :param run_length: batches are made of runs of so many transitions that follow each other in an episode; above 1,
+        objectives that embed both observations have fewer to embed (docs/pretraining.md)
     :param holdout: share of the episodes that is only evaluated on, 0 <= holdout < 1
     :param log_interval: updates between two rows of the log
     :param checkpoint_interval: updates between two checkpoints
@@ -32,6 +34,7 @@ class PretrainConfig:
     batch_size: int = 256
     learning_rate: float | str = 1e-4
     k: int | list[int] = 1
+    run_length: int = 1
     holdout: float = 0.05
     log_interval: int = 500
     checkpoint_interval: int = 1_000
@@ -40,7 +43,7 @@ class PretrainConfig:
     objective_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("n_updates", "batch_size", "log_interval", "checkpoint_interval"):
+        for name in ("n_updates", "batch_size", "run_length", "log_interval", "checkpoint_interval"):
             value = getattr(self, name)
             if not _is_count(value):
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
@@ -71,6 +74,16 @@ class PretrainConfig:
         if not self.learning_rate.startswith("lin_") or not initial > 0:
             raise ValueError(f"learning_rate must be a number or lin_NUMBER, got {self.learning_rate!r}")
         return initial * (1.0 - n_updates / self.n_updates)
+
+    def as_settings(self) -> dict[str, Any]:
+        """The settings by name, as encoder files hold them.
+
+        Those of files from before ``run_length`` existed stay equal to those of the same run now.
+        """
+        settings = dataclasses.asdict(self)
+        if self.run_length == 1:
+            del settings["run_length"]
+        return settings
 
     @classmethod
     def from_mapping(cls, mapping: dict[str, Any]) -> "PretrainConfig":

@@ -1,6 +1,5 @@
 """One pretraining run: its parts, its position, how both are saved, and the training loop."""
 
-import dataclasses
 import itertools
 import json
 import platform
@@ -53,7 +52,7 @@ class PretrainRun:
             "objective": objective,
             "seed": seed,
             "dataset_digest": dataset.digest,
-            **dataclasses.asdict(config),
+            **config.as_settings(),
         }
         if base is not None:
             base_file = load_encoder(base)
@@ -236,19 +235,24 @@ class PretrainRun:
 
     def _pass(self, batch_size: int, part: Part, epoch: int = 0, start: int = 0) -> Iterator[TransitionBatch]:
         sequences = self.module.reads_action_sequences
-        k = self.config.k
-        return self.dataset.batches(batch_size, k, self.seed, epoch, start, part=part, sequences=sequences)
+        # What is evaluated on is the same for all lengths of runs.
+        k, run_length = self.config.k, self.config.run_length if part == "train" else 1
+        return self.dataset.batches(
+            batch_size, k, self.seed, epoch, start, part=part, sequences=sequences, run_length=run_length
+        )
 
     def _to_tensors(self, batch: TransitionBatch) -> TensorBatch:
         """Through SB3's own preprocessing, so that pretraining sees the numbers that RL will see."""
         space = self.dataset.observation_space
         # Bytes are put in channels-last order before they become floats, four times as large.
-        observations, next_observations = (
-            preprocess_obs(th.as_tensor(frames).contiguous(memory_format=th.channels_last).to(self.device), space)
-            for frames in (batch.observations, batch.next_observations)
+        frames = th.as_tensor(batch.frames).contiguous(memory_format=th.channels_last).to(self.device)
+        observations = preprocess_obs(frames, space)
+        assert isinstance(observations, th.Tensor)
+        now, later = (
+            where if isinstance(where, slice) else th.as_tensor(where).to(self.device)
+            for where in (batch.now, batch.later)
         )
-        assert isinstance(observations, th.Tensor) and isinstance(next_observations, th.Tensor)
-        return TensorBatch(observations, th.as_tensor(batch.actions).to(self.device), next_observations)
+        return TensorBatch(observations, th.as_tensor(batch.actions).to(self.device), now, later)
 
     def _log(self, logger: Logger, sums: dict[str, float]) -> None:
         row = {f"train/{name}": value / self.config.log_interval for name, value in sums.items()}
@@ -303,7 +307,7 @@ def reproducing_commands(settings: dict[str, Any], config: PretrainConfig, meta:
         commands.append(f"python -m sb3_abisim.collect {shlex.join(collect)}")
     words = ["--objective", settings["objective"], "--env", meta["env_id"], "--seed", str(settings["seed"])]
     words += ["--data", "DATA", "-o", "FILE"] + (["--base", "BASE"] if "base_digest" in settings else [])
-    words += ["-params", *(f"{name}:{json.dumps(value)}" for name, value in dataclasses.asdict(config).items())]
+    words += ["-params", *(f"{name}:{json.dumps(value)}" for name, value in config.as_settings().items())]
     commands.append(f"python -m sb3_abisim.pretrain {shlex.join(words)}")
     return commands
 

@@ -33,7 +33,7 @@ def make_batch(action_space, n=256, seed=0, noise=0.0):
     else:
         actions = 2 * th.rand(n, 2, generator=generator) - 1
         s_next[:, 0, 0, :2] += 0.2 * actions
-    return TensorBatch(s, actions, s_next)
+    return TensorBatch.of(s, actions, s_next)
 
 
 def fit(objective: Objective, batch: TensorBatch, n_updates: int = 250) -> Objective:

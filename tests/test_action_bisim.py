@@ -43,7 +43,7 @@ def make_batch(action_space=DISCRETE, n=6):
         if isinstance(action_space, gym.spaces.Discrete)
         else 2 * th.rand(n, 2, generator=generator) - 1
     )
-    return TensorBatch(th.rand(n, 1, 1, 4, generator=generator), actions, th.rand(n, 1, 1, 4, generator=generator))
+    return TensorBatch.of(th.rand(n, 1, 1, 4, generator=generator), actions, th.rand(n, 1, 1, 4, generator=generator))
 
 
 def l1(x, y):
@@ -237,7 +237,7 @@ def chain():
     s = [i for i in following for _ in range(2)] * 6
     actions = [0, 1] * 18
     s_next = [following[i][a] for i, a in zip(s, actions, strict=True)]
-    batch = TensorBatch(observations[s], th.tensor(actions), observations[s_next])
+    batch = TensorBatch.of(observations[s], th.tensor(actions), observations[s_next])
     base = LineEncoder(1)
     base.layers = nn.Sequential(nn.Flatten(), nn.Linear(4, 1, bias=False))
     with th.no_grad():

@@ -67,7 +67,7 @@ def test_an_embedding_of_its_pictures_serves_the_next_observations_not_at_all():
     th.manual_seed(1)
     one = objective.loss(batch)[0]
     th.manual_seed(1)
-    other = objective.loss(TensorBatch(batch.observations, 2 - batch.actions, 1 - batch.next_observations))[0]
+    other = objective.loss(TensorBatch.of(batch.observations, 2 - batch.actions, 1 - batch.next_observations))[0]
     assert float(one) == float(other)
 
 
@@ -80,7 +80,7 @@ def test_decoder_fits_every_picture(shape):
 def test_decoder_takes_its_shape_from_the_encoder():
     objective = BetaVAE(PointMazeEncoder(n_input_channels=2), DISCRETE)
     pictures = th.rand(2, 2, 64, 64)
-    objective.loss(TensorBatch(pictures, th.zeros(2, dtype=th.int64), pictures))
+    objective.loss(TensorBatch.of(pictures, th.zeros(2, dtype=th.int64), pictures))
 
 
 @pytest.mark.parametrize("kl_weight", [-1.0, math.nan, math.inf])

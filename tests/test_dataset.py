@@ -1,8 +1,10 @@
+import functools
 import json
 import pickle
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import index_env
 import numpy as np
@@ -151,6 +153,8 @@ def test_too_large_k_names_the_longest_segment(dataset: TransitionDataset) -> No
         dataset.valid_starts(index_env.LIMIT + 1)
     with pytest.raises(ValueError, match="at least 1, got 0"):
         dataset.batches(4, k=0)
+    with pytest.raises(ValueError, match="run_length must be at least 1, got 0"):
+        dataset.batches(4, run_length=0)
 
 
 def as_rows(batches: Iterator[dataset_module.TransitionBatch]) -> np.ndarray:
@@ -159,13 +163,15 @@ def as_rows(batches: Iterator[dataset_module.TransitionBatch]) -> np.ndarray:
 
 
 def test_order_follows_from_seed_and_epoch_and_start_skips_batches(dataset: TransitionDataset) -> None:
-    whole = as_rows(dataset.batches(16, seed=5, epoch=2))
-    assert len(whole) == N // 16
-    assert (as_rows(dataset.batches(16, seed=5, epoch=2)) == whole).all()
-    assert (as_rows(dataset.batches(16, seed=5, epoch=2, start=10)) == whole[10:]).all()
-    assert len(as_rows(dataset.batches(16, start=len(whole)))) == 0
-    for other in (dataset.batches(16, seed=5, epoch=3), dataset.batches(16, seed=6, epoch=2)):
-        assert (as_rows(other) != whole).all()
+    for run_length in (1, 4):
+        batches = functools.partial(dataset.batches, 16, run_length=run_length)
+        whole = as_rows(batches(seed=5, epoch=2))
+        assert len(whole) == N // 16
+        assert (as_rows(batches(seed=5, epoch=2)) == whole).all()
+        assert (as_rows(batches(seed=5, epoch=2, start=10)) == whole[10:]).all()
+        assert len(as_rows(batches(start=len(whole)))) == 0
+        for other in (batches(seed=5, epoch=3), batches(seed=6, epoch=2)):
+            assert (as_rows(other) != whole).all()
 
 
 def test_a_pass_visits_every_transition_once(dataset: TransitionDataset) -> None:
@@ -173,6 +179,41 @@ def test_a_pass_visits_every_transition_once(dataset: TransitionDataset) -> None
     starts = dataset.valid_starts(2)
     visited = [label for b in dataset.batches(1, k=2) for label in map(tuple, labels(b.observations))]
     assert sorted(visited) == sorted(map(tuple, labels(dataset.frames(starts))))
+
+
+@pytest.mark.parametrize(("k", "most_frames"), [(1, 25), (3, 32), ((2, 4), 25)])
+def test_runs_visit_every_pair_once_and_share_its_frames(dataset: TransitionDataset, k: Any, most_frames: int) -> None:
+    starts, _ = dataset.pairs(k)
+    whole = list(dataset.batches(len(starts), k=k, run_length=4))
+    plain = list(dataset.batches(len(starts), k=k))
+    assert len(whole) == len(plain) == 1
+    assert sorted(as_transitions(whole[0])) == sorted(as_transitions(plain[0]))
+    assert len(plain[0].frames) == 2 * len(starts)
+    n_frames = [len(batch.frames) for batch in dataset.batches(16, k=k, run_length=4)]
+    assert np.mean(n_frames) < most_frames and max(len(batch.frames) for batch in dataset.batches(16, k=k)) == 32
+
+
+def as_transitions(batch: dataset_module.TransitionBatch) -> list[tuple[int, ...]]:
+    both = np.concatenate([labels(batch.observations), labels(batch.next_observations)], axis=1)
+    return [tuple(row) for row in both.tolist()]
+
+
+def test_runs_follow_an_episode_and_end_with_it(dataset: TransitionDataset) -> None:
+    """Of the frames of a run of three, the index that is painted into each counts up by one."""
+    lengths, seen = [], set()
+    for epoch in range(4):
+        (batch,) = dataset.batches(N, epoch=epoch, run_length=3)
+        now, later = labels(batch.observations), labels(batch.next_observations)
+        assert (later[:, 1] == now[:, 1]).all() and (later[:, 0] == now[:, 0] + 1).all()
+        joined = (now[1:, :2] == later[:-1, :2]).all(axis=1)
+        first = np.flatnonzero(np.r_[True, ~joined])
+        lengths.append(np.diff(np.r_[first, N]))
+        seen |= {tuple(row) for row in now[first, :2].tolist()}
+    # Two runs of an episode that meet by chance count as one here.
+    assert np.mean([(length <= 3).mean() for length in lengths]) > 0.9
+    assert np.mean(np.concatenate(lengths)) > 2
+    # Where runs begin differs from pass to pass.
+    assert len(seen) > 1.3 * len(lengths[0])
 
 
 def test_batch_larger_than_the_data_is_refused(dataset: TransitionDataset) -> None:

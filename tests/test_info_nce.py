@@ -12,7 +12,7 @@ from sb3_abisim.objectives.info_nce import InfoNCE, info_nce_loss
 
 
 def as_sequences(batch):
-    return TensorBatch(batch.observations, batch.actions[:, None], batch.next_observations)
+    return TensorBatch.of(batch.observations, batch.actions[:, None], batch.next_observations)
 
 
 def distance(x, y):
@@ -54,7 +54,7 @@ def test_negatives_of_sequences_are_the_others_of_the_batch_that_differ(space):
     objective, single = InfoNCE(LineEncoder(), space, k=2), make_batch(space, 6)
     actions = th.stack([single.actions, single.actions.flip(0)], dim=1)
     actions[3] = actions[1]  # an equal sequence is no negative
-    batch = TensorBatch(single.observations, actions, single.next_observations)
+    batch = TensorBatch.of(single.observations, actions, single.next_observations)
     psi, psi_next = objective.encoder(batch.observations), objective.encoder(batch.next_observations)
     sequences = [th.cat([objective.action_inputs(a)[t] for t in range(2)]) for a in actions]
     total = 0.0
@@ -85,10 +85,10 @@ def test_ranks_the_action_of_unseen_transitions_first(space, chance):
 def test_learns_nothing_from_actions_that_do_nothing():
     th.manual_seed(0)
     batch = as_sequences(make_batch(DISCRETE, 512))
-    still = TensorBatch(batch.observations, batch.actions, batch.observations)
+    still = TensorBatch.of(batch.observations, batch.actions, batch.observations)
     objective = fit(InfoNCE(LineEncoder(), DISCRETE), still, 100)
     unseen = as_sequences(make_batch(DISCRETE, 512, seed=9))
-    unseen = TensorBatch(unseen.observations, unseen.actions, unseen.observations)
+    unseen = TensorBatch.of(unseen.observations, unseen.actions, unseen.observations)
     assert float(objective.loss(unseen)[1]["accuracy"]) < 0.45
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, make_batch
 
+from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.objectives.inverse import ACRO, InverseDynamics, adaptive_beta, inverse_dynamics_loss
 
 
@@ -47,6 +48,21 @@ def test_discrete_prediction_term_is_cross_entropy():
     loss, terms = objective.loss(batch)
     assert float(loss) == pytest.approx(total / 7, rel=1e-4)
     assert float(terms["accuracy"]) == pytest.approx(hits / 7)
+
+
+def test_frames_that_transitions_share_count_for_each_of_them():
+    th.manual_seed(0)
+    frames, actions = th.rand(5, 1, 1, 4), th.tensor([0, 2, 1, 0])
+    now, later = th.tensor([0, 1, 1, 3]), th.tensor([1, 2, 3, 4])
+    gradients = []
+    for batch in (TensorBatch(frames, actions, now, later), TensorBatch.of(frames[now], actions, frames[later])):
+        th.manual_seed(1)
+        objective = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.1)
+        assert th.equal(batch.observations, frames[now]) and th.equal(batch.next_observations, frames[later])
+        loss, _ = objective.loss(batch)
+        loss.backward()
+        gradients.append([loss.detach(), *(p.grad for p in objective.parameters())])
+    assert all(th.allclose(a, b, rtol=1e-4, atol=1e-6) for a, b in zip(*gradients, strict=True))
 
 
 @th.no_grad()

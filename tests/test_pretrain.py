@@ -100,13 +100,22 @@ class Interrupted(Exception):
 
 
 @pytest.mark.parametrize(
-    ("objective", "stop_at"),
-    [("ssi", 3), ("ssi", 29), ("acro", 12), ("beta_vae", 12), ("curl", 12), ("info_nce", 12), ("abisim", 12)],
+    ("objective", "stop_at", "run_length"),
+    [
+        ("ssi", 3, 1),
+        ("ssi", 29, 1),
+        ("ssi", 12, 8),
+        ("acro", 12, 1),
+        ("beta_vae", 12, 1),
+        ("curl", 12, 1),
+        ("info_nce", 12, 4),
+        ("abisim", 12, 1),
+    ],
 )
-def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, objective, stop_at):
+def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, objective, stop_at, run_length):
     kwargs = {}
     base = str(run(data, tmp_path / "base.safetensors"))
-    config = load_config(objective, "Nav2D-v0", SETTINGS)
+    config = load_config(objective, "Nav2D-v0", {**SETTINGS, "run_length": run_length})
     if objective == "abisim":
         kwargs["base"] = base
     # Different folders, equal names: what is compared must not hold the path.
@@ -244,6 +253,13 @@ def test_second_writer_is_refused(data, tmp_path):
     (tmp_path / "ssi.run").mkdir()
     with folder_lock(tmp_path / "ssi.run"), pytest.raises(ValueError, match=str(os.getpid())):
         run(data, tmp_path / "ssi.safetensors")
+
+
+def test_files_from_before_runs_of_transitions_existed_stay_those_of_the_same_run(data, tmp_path):
+    output = run(data, tmp_path / "ssi.safetensors")
+    assert "run_length" not in load_encoder(str(output)).contract["settings"]
+    with pytest.raises(ValueError, match="run_length: None there, 8 here"):
+        run(data, output, run_length=8)
 
 
 def test_held_out_transitions_are_not_trained_on(data, tmp_path, monkeypatch):

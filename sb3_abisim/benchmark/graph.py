@@ -174,7 +174,7 @@ def encoder_cell(plan: Plan, env_id: str, objective: str, seed: int) -> Cell:
         inputs += (encoder_cell(plan, env_id, "ssi", seed),)
     words = _params_of(plan.pretrain_params, objective, OBJECTIVE_NAMES)
     config = load_config(objective, env_id, parse_overrides(words))
-    settings = {"objective": objective, "env_id": env_id, "seed": seed, **dataclasses.asdict(config)}
+    settings = {"objective": objective, "env_id": env_id, "seed": seed, **config.as_settings()}
     output = f"encoders/{env_id}/{objective}-{_key('encoder', settings, inputs)[:8]}.safetensors"
     command = ["sb3_abisim.pretrain", "--objective", objective, "--env", env_id, "--data", inputs[0].output]
     command += ["-o", output, "--seed", str(seed), "--device", plan.device, "--verbose", "0"]

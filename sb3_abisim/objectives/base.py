@@ -14,15 +14,51 @@ from sb3_abisim.networks import Encoder
 class TensorBatch:
     """Transitions (s_t, a_t, s_{t+k}) on a device, observations already through SB3's ``preprocess_obs``.
 
-    :param observations: float (batch, channels, height, width) in 0..1
+    :param frames: float (m, channels, height, width) in 0..1; those that several transitions share stand once
     :param actions: a_t, int64 (batch,) for ``Discrete``, float32 (batch, action_dim) for ``Box``; with a second
         dimension k where an objective reads a_t to a_{t+k-1}
-    :param next_observations: s_{t+k}, as ``observations``
+    :param now: where s_t stands among the frames, int64 (batch,) or a slice
+    :param later: where s_{t+k} stands among them
     """
 
-    observations: th.Tensor
+    frames: th.Tensor
     actions: th.Tensor
-    next_observations: th.Tensor
+    now: th.Tensor | slice
+    later: th.Tensor | slice
+
+    @classmethod
+    def of(cls, observations: th.Tensor, actions: th.Tensor, next_observations: th.Tensor) -> "TensorBatch":
+        """A batch of transitions that share no frame.
+
+        :param observations: s_t, float (batch, channels, height, width) in 0..1
+        :param actions: see the class
+        :param next_observations: s_{t+k}, as ``observations``
+        """
+        n = len(observations)
+        return cls(th.cat([observations, next_observations]), actions, slice(None, n), slice(n, None))
+
+    @property
+    def observations(self) -> th.Tensor:
+        """s_t, float (batch, channels, height, width) in 0..1."""
+        return _rows(self.frames, self.now)
+
+    @property
+    def next_observations(self) -> th.Tensor:
+        """s_{t+k}, as ``observations``."""
+        return _rows(self.frames, self.later)
+
+    def at_both_ends(self, embeddings: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Embeddings of s_t and of s_{t+k}.
+
+        :param embeddings: of the frames, (m, features_dim)
+        :return: two tensors (batch, features_dim)
+        """
+        return _rows(embeddings, self.now), _rows(embeddings, self.later)
+
+
+def _rows(tensor: th.Tensor, where: th.Tensor | slice) -> th.Tensor:
+    # Unlike tensor[where], the gradient of index_select adds up in a fixed order on several threads, too.
+    return tensor[where] if isinstance(where, slice) else tensor.index_select(0, where)
 
 
 class Objective(nn.Module):

@@ -84,7 +84,7 @@ class InfoNCE(Objective):
 
         :param batch: transitions with ``actions`` of shape (batch, k) or (batch, k, action_dim)
         """
-        psi, psi_next = self.encoder(th.cat([batch.observations, batch.next_observations])).chunk(2)
+        psi, psi_next = batch.at_both_ends(self.encoder(batch.frames))
         pairs = th.cat([psi, psi_next - psi], dim=1)
         if self.n_actions is not None and self.k == 1:
             candidates = self.action_encoder(th.eye(self.n_actions, device=pairs.device))

@@ -89,9 +89,7 @@ class InverseDynamics(Objective):
 
         :param batch: transitions (s_t, a_t, s_{t+k})
         """
-        # One pass for both ends of the transition.
-        both = self.encoder(th.cat([batch.observations, batch.next_observations]))
-        psi, psi_next = both.chunk(2)
+        psi, psi_next = batch.at_both_ends(self.encoder(batch.frames))
         log_prob, accuracy = self._score(self.inverse_model(th.cat([psi, psi_next - psi], dim=1)), batch.actions)
         beta = th.as_tensor(self.l1_penalty)
         if self.adaptive is not None:
