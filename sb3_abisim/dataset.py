@@ -57,8 +57,8 @@ class TransitionBatch:
 
     frames: NDArray[np.uint8]
     actions: NDArray[Any]
-    now: Any
-    later: Any
+    now: NDArray[np.int64] | slice
+    later: NDArray[np.int64] | slice
 
     @property
     def observations(self) -> NDArray[np.uint8]:

@@ -11,11 +11,14 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
 from sb3_abisim.pretrain_config import PretrainConfig, load_config
+
+if TYPE_CHECKING:
+    from sb3_abisim.pretrain_run import Callback
 
 OBJECTIVE_NAMES = ("ssi", "acro", "beta_vae", "curl", "info_nce", "abisim")
 
@@ -30,6 +33,7 @@ def pretrain(
     device: str = "auto",
     progress_bar: bool = True,
     verbose: int = 1,
+    callback: "Callback | None" = None,
 ) -> Path:
     """Train an encoder and write its file and card; go on where an interrupted call with the same arguments stopped.
 
@@ -43,6 +47,8 @@ def pretrain(
     :param device: "auto", "cpu", "cuda", ...
     :param progress_bar: show one
     :param verbose: 1 prints the log's rows
+    :param callback: takes the encoder in evaluation mode at every row of the log and returns further numbers for it, by
+        name; the encoder file does not depend on it
     :return: the encoder file
     :raises ValueError: if the output belongs to other settings, or anything does not fit together
     :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
@@ -68,7 +74,7 @@ def pretrain(
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with folder_lock(folder):
-            run = PretrainRun(objective, dataset, output, config, base, seed, device)
+            run = PretrainRun(objective, dataset, output, config, base, seed, device, callback)
             if run.is_finished():
                 if verbose:
                     print(f"{output} is finished already; nothing to do")

@@ -4,7 +4,7 @@ import itertools
 import json
 import platform
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,13 @@ from tqdm import tqdm
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.checkpoint import load_encoder, save_encoder
 from sb3_abisim.dataset import Part, TransitionBatch, TransitionDataset
-from sb3_abisim.networks import make_encoder
+from sb3_abisim.networks import Encoder, make_encoder
 from sb3_abisim.objectives import OBJECTIVES, Objective, TensorBatch
 from sb3_abisim.pretrain_config import PretrainConfig
 from sb3_abisim.training_state import load_training_state, save_training_state
+
+# From the encoder in evaluation mode to further numbers for a row of the log.
+Callback = Callable[[Encoder], Mapping[str, float]]
 
 N_GOLDEN = 8
 N_STANDARDIZE = 4096
@@ -39,8 +42,10 @@ class PretrainRun:
         base: str | None,
         seed: int,
         device: str,
+        callback: Callback | None = None,
     ) -> None:
         self.dataset, self.output, self.config, self.seed = dataset, output, config, seed
+        self.callback = callback
         self.folder = output.with_suffix(".run")
         self.device = get_device(device)
         objective_kwargs = dict(config.objective_kwargs)
@@ -150,7 +155,10 @@ class PretrainRun:
             "features_dim": self.module.encoder.features_dim,
             "n_parameters": n_parameters,
             "metrics": self.rows[-1] if self.rows else {},
-            "curves": {key: [row[key] for row in self.rows] for key in (self.rows[0] if self.rows else {})},
+            # A callback may have been there for some of the rows only.
+            "curves": {
+                key: [row.get(key) for row in self.rows] for key in dict.fromkeys(k for r in self.rows for k in r)
+            },
             "versions": {"python": platform.python_version(), "torch": th.__version__.split("+")[0]},
             "device": self.device.type,
         }
@@ -257,6 +265,7 @@ class PretrainRun:
     def _log(self, logger: Logger, sums: dict[str, float]) -> None:
         row = {f"train/{name}": value / self.config.log_interval for name, value in sums.items()}
         row |= {f"test/{name}": value for name, value in self._evaluate().items()}
+        row |= self._called_back()
         self.rows.append({"n_updates": self.n_updates, **row})
         for name, value in row.items():
             logger.record(name, value)
@@ -276,6 +285,14 @@ class PretrainRun:
         for name in rows[0] if rows else ():
             means[name] = sum(float(row[name]) for row in rows) / len(rows)
         return means
+
+    def _called_back(self) -> dict[str, float]:
+        if self.callback is None:
+            return {}
+        self.module.eval()
+        # Whatever it draws, training goes on as without it.
+        with th.no_grad(), th.random.fork_rng(devices=[]):
+            return {name: float(value) for name, value in self.callback(self.module.encoder).items()}
 
     def _logger(self, verbose: int) -> Logger:
         """SB3's logger, with the rows of an interrupted run written again so that the table is whole."""

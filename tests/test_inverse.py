@@ -31,6 +31,9 @@ def test_adaptive_beta(accuracy):
     alpha = th.tensor(accuracy)
     assert float(adaptive_beta(2.0, alpha, "paper")) == pytest.approx(2.0 * (1 - math.exp(-4 * accuracy**2)))
     assert float(adaptive_beta(2.0, alpha, "released")) == pytest.approx(2.0 * math.exp(-5 * (accuracy - 1) ** 2))
+    skill = max(0.0, (accuracy - 0.25) / 0.75)
+    expected = 2.0 * (1 - math.exp(-4 * skill**2))
+    assert float(adaptive_beta(2.0, alpha, "above_chance", 0.25)) == pytest.approx(expected)
 
 
 @th.no_grad()
@@ -110,6 +113,16 @@ def test_penalty_makes_the_embedding_ignore_what_actions_do_not_move():
             )
         sensitivity[penalty] = change["uncontrolled"] / change["controlled"]
     assert sensitivity[0.1] < 0.4 * sensitivity[0.0]
+
+
+@pytest.mark.parametrize(("space", "chance"), [(DISCRETE, 1 / DISCRETE.n), (CONTINUOUS, 0.0)])
+def test_chance_is_that_of_the_action_space(space, chance):
+    objective = InverseDynamics(LineEncoder(), space, l1_penalty=0.5, adaptive="above_chance")
+    objective.accuracy.fill_(0.4)
+    expected = 0.5 * (1 - math.exp(-4 * ((0.4 - chance) / (1 - chance)) ** 2))
+    assert float(objective.loss(make_batch(space))[1]["beta"]) == pytest.approx(expected)
+    objective.accuracy.fill_(chance)
+    assert float(objective.loss(make_batch(space))[1]["beta"]) == 0.0
 
 
 def test_adaptive_beta_follows_the_previous_accuracy():

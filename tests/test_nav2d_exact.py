@@ -149,9 +149,15 @@ def test_short_sighted_encoder_has_a_profile_error(base, few_cells):
 
 def test_untrained_encoder_does_not_agree(base, few_cells):
     th.manual_seed(0)
-    comparison = ExactReference(base, c=0.9, n_layouts=1).compare(Nav2DEncoder().eval())
+    reference, untrained = ExactReference(base, c=0.9, n_layouts=1), Nav2DEncoder().eval()
+    comparison = reference.compare(untrained)
     assert comparison.map_correlation < 0.9
     assert comparison.profile_error > 0.2
+    assert reference.terms(untrained) == {
+        "exact/map_correlation": comparison.map_correlation,
+        "exact/state_correlation": comparison.state_correlation,
+        "exact/profile_error": comparison.profile_error,
+    }
 
 
 def test_goal_is_never_toggled():

@@ -28,9 +28,9 @@ def data(tmp_path_factory):
     return folder
 
 
-def run(data, output, objective="ssi", **settings):
+def run(data, output, objective="ssi", callback=None, **settings):
     config = load_config(objective, "Nav2D-v0", {**SETTINGS, **settings})
-    return pretrain(objective, data, output, config, device="cpu", progress_bar=False, verbose=0)
+    return pretrain(objective, data, output, config, device="cpu", progress_bar=False, verbose=0, callback=callback)
 
 
 def test_writes_encoder_card_and_log(data, tmp_path):
@@ -45,6 +45,22 @@ def test_writes_encoder_card_and_log(data, tmp_path):
     assert len(log.read_text().splitlines()) == 7
     assert not list(output.with_suffix(".run").glob("checkpoint*")), "checkpoints go when the run is over"
     assert list(output.with_suffix(".run").glob("events.out.tfevents*"))
+
+
+def test_a_callback_adds_to_the_log_and_changes_nothing_else(data, tmp_path):
+    plain = run(data, tmp_path / "plain.safetensors")
+    modes = []
+
+    def callback(encoder):
+        modes.append(encoder.training)
+        return {"exact/size": encoder(th.rand(2, 3, 15, 15)).abs().sum()}
+
+    output = run(data, tmp_path / "logged.safetensors", callback=callback)
+    assert output.read_bytes() == plain.read_bytes()
+    assert modes == [False] * 6
+    sizes = json.loads(output.with_suffix(".json").read_text())["curves"]["exact/size"]
+    assert len(sizes) == 6 and all(size > 0 for size in sizes)
+    assert "exact/size" in (output.with_suffix(".run") / "progress.csv").read_text().splitlines()[0].split(",")
 
 
 def test_the_commands_on_the_card_make_the_same_encoder(data, tmp_path, capsys):

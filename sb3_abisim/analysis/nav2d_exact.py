@@ -241,6 +241,15 @@ class ExactReference:
             profile_error=float(np.abs(here - there).max()),
         )
 
+    def terms(self, encoder: Encoder) -> dict[str, float]:
+        """The comparison as numbers for a log: the ``callback`` of :func:`sb3_abisim.pretrain.pretrain`.
+
+        :param encoder: any encoder of Nav2D, in evaluation mode
+        """
+        comparison = self.compare(encoder)
+        names = ("map_correlation", "state_correlation", "profile_error")
+        return {f"exact/{name}": getattr(comparison, name) for name in names}
+
 
 def spearman(x: NDArray[Any], y: NDArray[Any]) -> float:
     """Spearman's rank correlation; NaN if either is constant.

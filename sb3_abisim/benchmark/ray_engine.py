@@ -43,7 +43,7 @@ class RayEngine:
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
         except ConnectionError as error:
             raise ValueError(f"no Ray cluster at {address!r} ({error}); start one with: ray start --head") from error
-        resources: dict[str, float] = ray.cluster_resources()  # type: ignore[no-untyped-call]
+        resources: dict[str, float] = ray.cluster_resources()
         room = int(resources.get("CPU", 0) // threads)
         room = min(room, int(resources.get("GPU", 0) / gpus)) if gpus else room
         if room < 1:

@@ -178,7 +178,8 @@ class Looks:
                 turned[i, shown] = pictures[i, channel, ::vertical, ::horizontal]
         first, last = self._first[indices], self._last[indices]
         # Where a range is turned round, both products wrap at 2^16, and their sum is right again.
-        return ((turned * (last - first) + np.uint16(256) * first) >> 8).astype(np.uint8)
+        changed: NDArray[np.uint8] = ((turned * (last - first) + np.uint16(256) * first) >> 8).astype(np.uint8)
+        return changed
 
 
 class BackgroundPlayer:

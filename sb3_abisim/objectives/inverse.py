@@ -25,7 +25,7 @@ from torch import nn
 from sb3_abisim.networks import MLP, Encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
 
-ADAPTIVE_FORMS = ("paper", "released")
+ADAPTIVE_FORMS = ("paper", "released", "above_chance")
 HIDDEN_DIM = 256
 _LOG_STD_RANGE = (-5.0, 2.0)
 
@@ -45,13 +45,21 @@ def inverse_dynamics_loss(
     return prediction + beta * l1_norm, {"prediction": prediction, "l1_norm": l1_norm}
 
 
-def adaptive_beta(beta_max: float, accuracy: th.Tensor, form: str) -> th.Tensor:
+def adaptive_beta(beta_max: float, accuracy: th.Tensor, form: str, chance: float = 0.0) -> th.Tensor:
     """The regularisation for the present accuracy: more of it once actions are predicted well.
+
+    Guessing one of n actions is right in 1 of n cases, for which both other forms already ask for some penalty: an
+    embedding that has found nothing yet can be held at zero by it for good. "above_chance" asks for none then.
 
     :param beta_max: largest weight
     :param accuracy: of the previous iteration, 0..1
-    :param form: "paper", ``beta_max (1 - exp(-4 alpha^2))``, or "released", ``beta_max exp(-5 (alpha - 1)^2)``
+    :param form: "paper", ``beta_max (1 - exp(-4 alpha^2))``, "released", ``beta_max exp(-5 (alpha - 1)^2)``, or
+        "above_chance" (ours), the paper's with alpha the share of the way from chance to certainty
+    :param chance: accuracy of guessing, below 1
     """
+    if form == "above_chance":
+        accuracy = ((accuracy - chance) / (1.0 - chance)).clamp_min(0.0)
+        form = "paper"
     if form == "paper":
         return beta_max * (1.0 - th.exp(-4.0 * accuracy**2))
     return beta_max * th.exp(-5.0 * (accuracy - 1.0) ** 2)
@@ -63,7 +71,7 @@ class InverseDynamics(Objective):
     :param encoder: the network to pretrain
     :param action_space: ``Discrete`` or one-dimensional ``Box``
     :param l1_penalty: beta, or beta_max with ``adaptive``
-    :param adaptive: None for a fixed beta, else "paper" or "released" (see :func:`adaptive_beta`)
+    :param adaptive: None for a fixed beta, else "paper", "released" or "above_chance" (see :func:`adaptive_beta`)
     """
 
     name = "ssi"
@@ -93,7 +101,9 @@ class InverseDynamics(Objective):
         log_prob, accuracy = self._score(self.inverse_model(th.cat([psi, psi_next - psi], dim=1)), batch.actions)
         beta = th.as_tensor(self.l1_penalty)
         if self.adaptive is not None:
-            beta = adaptive_beta(self.l1_penalty, self.accuracy, self.adaptive)
+            # Continuous accuracy is a coefficient of determination, 0 for a guess.
+            chance = 0.0 if self.n_actions is None else 1.0 / self.n_actions
+            beta = adaptive_beta(self.l1_penalty, self.accuracy, self.adaptive, chance)
         loss, terms = inverse_dynamics_loss(log_prob, psi, psi_next, beta)
         if self.training:
             self.accuracy.copy_(accuracy)
