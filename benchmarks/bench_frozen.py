@@ -120,9 +120,9 @@ def main(argv: list[str] | None = None) -> None:
         "|---|---:|---:|---:|---:|---:|---:|",
     ]
     tail = (
-        "The bound is the speed (and the ratio) that `VecEncodeObservations` would have if environment and encoder took",
-        "no time at all: what is left is Stable-Baselines3's own work on the embeddings (policy, buffers, and updates of",
-        "the heads with Adam), which no encoder makes cheaper.",
+        "The bound is the speed (and the ratio) that `VecEncodeObservations` would have if environment and encoder",
+        "took no time at all: what is left is Stable-Baselines3's own work on the embeddings (policy, buffers, and",
+        "updates of the heads with Adam), which no encoder makes cheaper.",
         "",
     )
     write_page(args.output, "Speed of RL on a frozen encoder", text, header, rows, tail)
