@@ -63,12 +63,14 @@ class TransitionBatch:
     @property
     def observations(self) -> NDArray[np.uint8]:
         """s_t, uint8 [B, C, H, W], in 0..255."""
-        return self.frames[self.now]
+        rows: NDArray[np.uint8] = self.frames[self.now]
+        return rows
 
     @property
     def next_observations(self) -> NDArray[np.uint8]:
         """s_{t+k}, uint8 [B, C, H, W]."""
-        return self.frames[self.later]
+        rows: NDArray[np.uint8] = self.frames[self.later]
+        return rows
 
 
 class TransitionDataset:

@@ -85,7 +85,7 @@ class VecEncodeObservations(VecEnvWrapper):
         :param frames: uint8 (batch, channels, height, width)
         :return: float32 (batch, features_dim)
         """
-        tensor = th.from_numpy(frames).to(self._device, memory_format=th.channels_last)
+        tensor = th.from_numpy(frames).to(self._device)
         embeddings: NDArray[np.float32] = embed(self._encoder, self.venv.observation_space, tensor).cpu().numpy()
         return embeddings
 
