@@ -10,9 +10,9 @@ from sb3_abisim.vec_env import VecEncodeObservations
 class EncoderCallback(BaseCallback):
     """States the encoders when training starts, refuses to train without their weights, and logs their drift.
 
-    Also states the fingerprint of the clips that the training environment shows, if it has one. Logs ``encoder/drift``
-    at the end of each rollout: how far the weights have moved from those that training started with, relative to the
-    norm of the latter (the largest value, where actor and critic have encoders of their own).
+    Also states the fingerprint of the clips or scans that the training environment shows, if it has one. Logs
+    ``encoder/drift`` at the end of each rollout: how far the weights have moved from those that training started with,
+    relative to the norm of the latter (the largest value, where actor and critic have encoders of their own).
 
     :param verbose: as in Stable-Baselines3
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
@@ -38,7 +38,7 @@ class EncoderCallback(BaseCallback):
             print("Encoder: none of sb3_abisim's, policy_kwargs names another features extractor")
         if self.training_env.has_attr("fingerprint"):
             (fingerprint,) = self.training_env.get_attr("fingerprint", indices=0)
-            print(f"Backgrounds of the training environment: {fingerprint}")
+            print(f"Pictures of the training environment: {fingerprint}")
 
     def _on_rollout_end(self) -> None:
         if self._extractors:

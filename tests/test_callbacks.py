@@ -128,4 +128,4 @@ def test_backgrounds_are_stated(capsys: pytest.CaptureFixture[str]) -> None:
     env = Grid()
     env.fingerprint = "0123abcd"  # type: ignore[attr-defined]
     learn(PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1), 16)
-    assert "Backgrounds of the training environment: 0123abcd\n" in capsys.readouterr().out
+    assert "Pictures of the training environment: 0123abcd\n" in capsys.readouterr().out

@@ -69,6 +69,27 @@ def test_frames_that_transitions_share_count_for_each_of_them():
 
 
 @th.no_grad()
+def test_change_weight():
+    """A weight of 4: a quarter of the state and four times the change; 1 is the plain input, to the bit."""
+    losses = []
+    for weight in (4.0, 1.0, None):
+        th.manual_seed(0)
+        kwargs = {} if weight is None else {"change_weight": weight}
+        objective = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.0, **kwargs)
+        batch = make_batch(DISCRETE, 7)
+        losses.append(float(objective.loss(batch)[0]))
+        if weight == 4.0:
+            psi, psi_next = objective.encoder(batch.observations), objective.encoder(batch.next_observations)
+            logits = objective.inverse_model(th.cat([0.25 * psi, 4 * psi_next - 4 * psi], dim=1))
+            chosen = logits.log_softmax(dim=1)[th.arange(7), batch.actions]
+            assert losses[0] == pytest.approx(-float(chosen.mean()), rel=1e-5)
+    assert losses[1] == losses[2] != losses[0]
+    for wrong in (0.0, math.inf, math.nan):
+        with pytest.raises(ValueError, match=f"change_weight must be a number above 0, got {wrong}"):
+            InverseDynamics(LineEncoder(), DISCRETE, change_weight=wrong)
+
+
+@th.no_grad()
 def test_continuous_prediction_term_is_gaussian():
     th.manual_seed(0)
     objective = InverseDynamics(LineEncoder(), CONTINUOUS, l1_penalty=0.0)

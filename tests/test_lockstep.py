@@ -25,6 +25,12 @@ def same(ours: Any, theirs: Any) -> bool:
     return type(ours) is type(theirs) and np.array_equal(ours, theirs)
 
 
+@pytest.mark.parametrize("env_id", ["ScanNav-v0", "DistractorPointMaze-v0"])
+def test_fingerprints_are_passed_on(env_id: str) -> None:
+    ours, theirs = (make(env_id, cls, n_envs=2) for cls in (LockstepVecEnv, DummyVecEnv))
+    assert ours.get_attr("fingerprint") == theirs.get_attr("fingerprint") and len(ours.get_attr("fingerprint")[0]) == 64
+
+
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_equals_dummy(env_id: str, tmp_path: Path) -> None:
     kwargs = {"monitor_kwargs": {"info_keywords": ("is_success",)}}

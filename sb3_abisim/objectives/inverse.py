@@ -72,20 +72,31 @@ class InverseDynamics(Objective):
     :param action_space: ``Discrete`` or one-dimensional ``Box``
     :param l1_penalty: beta, or beta_max with ``adaptive``
     :param adaptive: None for a fixed beta, else "paper", "released" or "above_chance" (see :func:`adaptive_beta`)
+    :param change_weight: how much more the inverse model's input shows of the change than of the state:
+        (psi(s) / w, w (psi(s') - psi(s))). Where the agent is a small part of a varied picture, a large weight lets the
+        change stand out from the start; 1 is the plain input
     """
 
     name = "ssi"
 
     def __init__(
-        self, encoder: Encoder, action_space: gym.Space[Any], l1_penalty: float = 1e-4, adaptive: str | None = None
+        self,
+        encoder: Encoder,
+        action_space: gym.Space[Any],
+        l1_penalty: float = 1e-4,
+        adaptive: str | None = None,
+        change_weight: float = 1.0,
     ) -> None:
         super().__init__(encoder, action_space)
         if not 0 <= l1_penalty < math.inf:
             raise ValueError(f"l1_penalty must be a number of at least 0, got {l1_penalty}")
         if adaptive is not None and adaptive not in ADAPTIVE_FORMS:
             raise ValueError(f"adaptive must be None or one of {ADAPTIVE_FORMS}, got {adaptive!r}")
+        if not 0 < change_weight < math.inf:
+            raise ValueError(f"change_weight must be a number above 0, got {change_weight}")
         self.l1_penalty = l1_penalty
         self.adaptive = adaptive
+        self.change_weight = change_weight
         n_outputs = self.n_actions or 2 * self.action_dim
         self.inverse_model = MLP(2 * encoder.features_dim, HIDDEN_DIM, n_outputs)
         # Accuracy of the previous iteration; a buffer, so that an interrupted run goes on with the same beta.
@@ -98,7 +109,8 @@ class InverseDynamics(Objective):
         :param batch: transitions (s_t, a_t, s_{t+k})
         """
         psi, psi_next = batch.at_both_ends(self.encoder(batch.frames))
-        log_prob, accuracy = self._score(self.inverse_model(th.cat([psi, psi_next - psi], dim=1)), batch.actions)
+        inputs = th.cat([psi / self.change_weight, self.change_weight * (psi_next - psi)], dim=1)
+        log_prob, accuracy = self._score(self.inverse_model(inputs), batch.actions)
         beta = th.as_tensor(self.l1_penalty)
         if self.adaptive is not None:
             # Continuous accuracy is a coefficient of determination, 0 for a guess.
