@@ -183,15 +183,16 @@ def test_every_entry_builds_its_model(manager: Any, tmp_path: Path, algo: str, e
 def test_shipped_encoders() -> None:
     """Needs the files under encoders/, which come from `python -m sb3_abisim.pretrain`."""
     for algo, env_id in ENTRIES:
-        # Encoders for scans are large and belong to one's own scans: none are shipped.
-        if env_id.startswith("ScanNav"):
+        # 256 pixels take a network too large to ship.
+        if env_id == "ScanNavPaper-v0":
             continue
         text = yaml.safe_load((resource_path("hyperparams") / f"{algo}.yml").read_text())[env_id]["policy_kwargs"]
         folder = text.split("'encoder': '")[1].split("/")[0]
-        for method in PRETRAINED:
+        for method in PRETRAINED if env_id != "ScanNav-v0" else ("ssi", "abisim"):
             contract = load_encoder(f"{folder}/{method}").contract
             assert (contract["env_id"], contract["objective"]) == (folder, method)
-            env = gym.make(env_id)
+            # Scans are pretrained on without the action stop, which no picture shows.
+            env = gym.make(env_id, **contract["env_kwargs"])
             load_encoder(f"{folder}/{method}").check(env.observation_space, env.action_space)
 
 
