@@ -25,7 +25,7 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
     other. "clean" shows the plain floor, for a comparison. The same seed gives the same mazes in all three.
 
     **Looks.** In "train" each episode shows its clip in a look of its own, mirrored and in other colours
-    (:class:`~sb3_abisim.envs.backgrounds.Looks`), unless ``recolour`` is False; "eval" shows clips as they are.
+    (:class:`~sb3_abisim.envs.looks.Looks`), unless ``recolour`` is False; "eval" shows clips as they are.
 
     **Factors.** Those of PointMaze, and ``clip``, the index of the clip in the split, ``clip_id``, a number that stands
     for its content in any split, and ``frame``, the index of the frame shown; int64, each -1 in the split "clean".

@@ -1,0 +1,53 @@
+"""Other appearances of moving backgrounds.
+
+A few clips have a few colours, and an encoder that has seen no others takes a saturated background for an agent that has
+moved (docs/figures.md). In training, each episode therefore shows its clip in a look of its own.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Looks:
+    """A look for each environment: mirrored or not, the channels exchanged, each over another range.
+
+    Integer arithmetic only: the same bytes on every machine.
+
+    :param n_envs: number of environments
+    """
+
+    def __init__(self, n_envs: int) -> None:
+        self._flips = np.ones((n_envs, 2), dtype=np.int64)
+        self._channels = np.tile(np.arange(3), (n_envs, 1))
+        # Intensity x becomes (256 first + (last - first) x) / 256, from `first` at 0 to nearly `last` at 255.
+        self._first = np.zeros((n_envs, 3, 1, 1), dtype=np.uint16)
+        self._last = np.full((n_envs, 3, 1, 1), 256, dtype=np.uint16)
+
+    def draw(self, index: int, generator: np.random.Generator) -> None:
+        """A new look for environment ``index``; half of the looks keep the range of each channel.
+
+        :param index: of the environment
+        :param generator: of the episode
+        """
+        self._flips[index] = 1 - 2 * generator.integers(0, 2, 2)
+        self._channels[index] = generator.permutation(3)
+        first, last = generator.integers(0, 256, (2, 3, 1, 1))
+        keeps_range = generator.random() < 0.5
+        self._first[index], self._last[index] = (0, 256) if keeps_range else (first, last)
+
+    def apply(self, pictures: NDArray[np.uint8], indices: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Pictures as they look in their environments.
+
+        :param pictures: uint8 (m, 3, height, width)
+        :param indices: of environments, shape (m,)
+        :return: a new array of the same shape
+        """
+        turned = np.empty_like(pictures)
+        rows = zip(self._channels[indices].tolist(), self._flips[indices].tolist(), strict=True)
+        for i, (channels, (vertical, horizontal)) in enumerate(rows):
+            for shown, channel in enumerate(channels):
+                turned[i, shown] = pictures[i, channel, ::vertical, ::horizontal]
+        first, last = self._first[indices], self._last[indices]
+        # Where a range is turned round, both products wrap at 2^16, and their sum is right again.
+        changed: NDArray[np.uint8] = ((turned * (last - first) + np.uint16(256) * first) >> 8).astype(np.uint8)
+        return changed
