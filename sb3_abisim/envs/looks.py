@@ -1,7 +1,7 @@
 """Other appearances of moving backgrounds.
 
-A few clips have a few colours, and an encoder that has seen no others takes a saturated background for an agent that has
-moved (docs/figures.md). In training, each episode therefore shows its clip in a look of its own.
+A few clips have a few colours, and an encoder that has seen no others takes a saturated background for an agent that
+has moved (docs/figures.md). In training, each episode therefore shows its clip in a look of its own.
 """
 
 import numpy as np
