@@ -33,7 +33,11 @@ def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
         lines = {short_name(name): result["profile"] for name, result in here.items()}
         show_profiles(row[n], lines, results["bins"], "m from agent to obstacle")
         row[n].tick_params(axis="x", rotation=30)
+        # One legend for the figure: six encoders' would cover the curves.
+        row[n].get_legend().remove()
         _show_changes(row[n + 1], here)
+    handles, labels = axes[0, n + 1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower right", ncols=min(n, 6), fontsize=8)
     figure.suptitle(f"Change of the embedding when one obstacle moves by 1 m, {results['env_id']}", fontsize=10)
     save(figure, path)
     _reduce_colours(path)
@@ -51,8 +55,6 @@ def _show_changes(axis: Any, here: dict[str, Any]) -> None:
     axis.axhline(1.0, color="0.5", lw=0.8, ls="--")
     axis.set_xticks(range(len(changes)), changes, fontsize=8)
     axis.set_ylabel("change (1: another state)")
-    axis.set_ylim(top=1.3 * axis.get_ylim()[1])
-    axis.legend(fontsize=7)
 
 
 def draw_neighbours(results: dict[str, Any], path: Path) -> None:
