@@ -89,8 +89,8 @@ def test_refuses(words, message, tmp_path, capsys):
 
 
 def test_environment_without_shipped_encoders():
-    with pytest.raises(ValueError, match="no encoder ships for ScanNav-v0"):
-        default_encoders("ScanNav-v0")
+    with pytest.raises(ValueError, match="no encoder ships for ScanNavPaper-v0"):
+        default_encoders("ScanNavPaper-v0")
 
 
 def test_own_folder_joins_the_shipped_ones(tmp_path):
