@@ -151,8 +151,16 @@ def test_a_killed_engine_leaves_no_orphan(tmp_path: Path) -> None:
         driver.send_signal(signal.SIGKILL)
         driver.wait()
     wait_until(lambda: _programs(tmp_path) == 0, "both are gone")
-    with folder_lock(tmp_path / "work" / "encoder-0"):
-        pass
+    # A dying process has no command line any more a moment before its files are closed.
+    wait_until(lambda: _is_free(tmp_path / "work" / "encoder-0"), "the lock is free", seconds=5)
+
+
+def _is_free(folder: Path) -> bool:
+    try:
+        with folder_lock(folder):
+            return True
+    except FolderLockedError:
+        return False
 
 
 def wait_until(condition, what: str, seconds: float = 60) -> None:
