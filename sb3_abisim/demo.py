@@ -11,15 +11,10 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from PIL import Image
+from sb3_abisim.film import film
 
 ENV_ID = "DistractorPointMaze-v0"
-GIF_EPISODES = 4
-GIF_FPS = 12
-GIF_PIXELS = 192
 
 
 def commands(folder: Path, n_transitions: int, n_updates: int, n_timesteps: int) -> list[list[str]]:
@@ -80,46 +75,6 @@ def draw_learning_curve(run: Path, path: Path, n_smooth: int = 100) -> None:
     plt.close(figure)
 
 
-def record_gif(run: Path, path: Path) -> float:
-    """Film the trained agent on unseen clips.
-
-    :param run: zoo run folder with the final model
-    :param path: the GIF to write
-    :return: share of the filmed episodes that reached the goal
-    """
-    import gymnasium as gym
-    from stable_baselines3 import PPO
-
-    from sb3_abisim.checkpoint import RUN_COPY
-    from sb3_abisim.frozen import fuse
-
-    # The run was trained on embeddings; fused with its encoder, the model acts on pictures.
-    model = fuse(PPO.load(run / f"{ENV_ID}.zip", device="cpu"), str(run / ENV_ID / RUN_COPY))
-    env = gym.make(ENV_ID, split="eval", render_mode="rgb_array")
-    frames, successes = [], 0
-    for episode in range(GIF_EPISODES):
-        observation, _ = env.reset(seed=episode)
-        done = False
-        while not done:
-            frames.append(_gif_frame(env.render()))
-            # The policy is stochastic in training, and a deterministic one can get stuck at a corner.
-            action, _ = model.predict(observation, deterministic=False)
-            observation, _, terminated, truncated, info = env.step(action)
-            done = terminated or truncated
-        successes += info["is_success"]
-        frames += [_gif_frame(env.render())] * GIF_FPS
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=1000 // GIF_FPS, loop=0)
-    return successes / GIF_EPISODES
-
-
-def _gif_frame(picture: Any) -> "Image.Image":
-    from PIL import Image
-
-    small = Image.fromarray(picture).resize((GIF_PIXELS, GIF_PIXELS))
-    # Of Pillow's ways to choose 256 colours this one keeps the red of the small agent.
-    return small.quantize(method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-
-
 def main(argv: list[str] | None = None) -> None:
     """The command; see ``--help``.
 
@@ -142,7 +97,7 @@ def main(argv: list[str] | None = None) -> None:
         subprocess.run([sys.executable, "-m", *words], check=True)
     run = newest_run(folder)
     draw_learning_curve(run, folder / "learning_curve.png")
-    success = record_gif(run, folder / "agent.gif")
+    success = film(run, folder / "agent.gif")
     minutes = (time.monotonic() - start) / 60
     print(f"\nDone in {minutes:.1f} minutes; the agent reached the goal in {success:.0%} of the filmed episodes.")
     print(f"  learning curve    {folder / 'learning_curve.png'}")

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_abisim.atomic import write_atomic
-from sb3_abisim.benchmark.runs import read_run
+from sb3_abisim.benchmark.runs import Run, read_run
 from sb3_abisim.checkpoint import RUN_COPY
 from sb3_abisim.frozen import fuse
 from sb3_abisim.vec_env import EncodedBox
@@ -39,22 +40,14 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
     :return: the file
     :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
     """
-    from rl_zoo3.utils import ALGOS
-
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     run = read_run(folder)
-    model_path = run.folder / f"{run.env_id}.zip"
-    if not model_path.is_file():
-        raise ValueError(f"{run.folder} holds no final model ({model_path.name}); let the run end first")
-    model = ALGOS[run.algo].load(model_path, device="cpu")
-    if isinstance(model.observation_space, EncodedBox):
-        # Trained on embeddings, and the environments here show pictures.
-        model = fuse(model, str(run.folder / run.env_id / RUN_COPY))
+    model = final_model(run)
     arrays: dict[str, NDArray[Any]] = {}
     for split in SPLITS if run.env_id in DISTRACTOR_IDS else (None,):
         for mode in MODES:
-            values = _episodes(model, run.env_id, _split_kwargs(run.env_kwargs, split), n_episodes, mode == MODES[0])
+            values = _episodes(model, run.env_id, split_kwargs(run.env_kwargs, split), n_episodes, mode == MODES[0])
             arrays |= {f"{mode}/{split or 'standard'}/{name}": array for name, array in values.items()}
     path = run.folder / FILE_NAME
     buffer = io.BytesIO()
@@ -63,7 +56,30 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
     return path
 
 
-def _split_kwargs(env_kwargs: dict[str, Any], split: str | None) -> dict[str, Any]:
+def final_model(run: Run) -> BaseAlgorithm:
+    """The model that a run ended with, on the CPU; it acts on pictures, whatever it was trained on.
+
+    :param run: a zoo run
+    :raises ValueError: if the run has not ended
+    """
+    from rl_zoo3.utils import ALGOS
+
+    path = run.folder / f"{run.env_id}.zip"
+    if not path.is_file():
+        raise ValueError(f"{run.folder} holds no final model ({path.name}); let the run end first")
+    model: BaseAlgorithm = ALGOS[run.algo].load(path, device="cpu")
+    if isinstance(model.observation_space, EncodedBox):
+        # Trained on embeddings, and the environments show pictures.
+        model = fuse(model, str(run.folder / run.env_id / RUN_COPY))
+    return model
+
+
+def split_kwargs(env_kwargs: dict[str, Any], split: str | None) -> dict[str, Any]:
+    """Arguments of an environment like the one of training, on other clips.
+
+    :param env_kwargs: of training
+    :param split: of the clips, None for an environment without any
+    """
     if split is None:
         return env_kwargs
     return {**{name: value for name, value in env_kwargs.items() if name not in ("split", "clips")}, "split": split}

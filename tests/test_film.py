@@ -1,0 +1,86 @@
+"""Films of zoo runs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from stable_baselines3 import PPO
+from zoo_inputs import SMALL
+
+from sb3_abisim import film as film_module
+from sb3_abisim import zoo
+from sb3_abisim.film import MILLISECONDS, N_LAST, film, main
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in an environment with a short time limit, in which the agent waits at a corner for its end."""
+    logs = tmp_path_factory.mktemp("logs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", [])
+        words = ["--algo", "ppo", "--env", "Nav2D-v0", "-f", str(logs), "--conf-file", "vanilla", "-n", "100"]
+        words += ["--env-kwargs", "max_episode_steps:9", "--eval-freq", "-1", "--num-threads", "1"]
+        zoo.main(["train", *words, "-params", *SMALL["ppo"]])
+    return logs / "ppo" / "Nav2D-v0_1"
+
+
+def pictures(path: Path) -> list[tuple[int, np.ndarray]]:
+    """Milliseconds and content of each picture that differs from the one before."""
+    with Image.open(path) as gif:
+        shown = []
+        for i in range(gif.n_frames):
+            gif.seek(i)
+            shown.append((gif.info["duration"], np.asarray(gif.convert("RGB"))))
+        return shown
+
+
+def test_every_step_is_shown_and_each_end_stays_for_a_second(run_folder, tmp_path, monkeypatch):
+    # Right and left in turns: no two neighbouring pictures are alike, unless the agent stands between walls.
+    turns = iter([2, 3] * 100)
+    monkeypatch.setattr(PPO, "predict", lambda *args, **kwargs: (np.int64(next(turns)), None))
+    success = film(run_folder, tmp_path / "a.gif", n_episodes=2, seed=3)
+    shown = pictures(tmp_path / "a.gif")
+    assert success in (0.0, 0.5, 1.0)
+    # Ten pictures for nine steps, with the run's own time limit; the last one stays.
+    assert sum(duration for duration, _ in shown) == 2 * (10 + N_LAST - 1) * MILLISECONDS
+    assert sum(duration >= N_LAST * MILLISECONDS for duration, _ in shown) == 2
+
+
+def test_of_a_long_episode_some_pictures_are_left_out(run_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(film_module, "MAX_PICTURES", 4)
+    film(run_folder, tmp_path / "a.gif", n_episodes=1)
+    # Every third of ten, the last among them.
+    assert sum(duration for duration, _ in pictures(tmp_path / "a.gif")) == (4 + N_LAST - 1) * MILLISECONDS
+
+
+def test_the_same_seed_films_the_same(run_folder, tmp_path):
+    for name in "ab":
+        film(run_folder, tmp_path / name, n_episodes=1, seed=5)
+    film(run_folder, tmp_path / "c", n_episodes=1, seed=6)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() != (tmp_path / "c").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere is no run folder of rl-zoo3"),
+        (["RUN", "--episodes", "0"], "n_episodes must be at least 1, got 0"),
+    ],
+)
+def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message):
+    words = [str(run_folder) if word == "RUN" else word for word in arguments]
+    with pytest.raises(SystemExit):
+        main([*words, "-o", str(tmp_path / "a.gif")])
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a.gif").exists()
+
+
+def test_a_run_that_goes_on_is_refused(run_folder, tmp_path):
+    model = run_folder / "Nav2D-v0.zip"
+    hidden = model.rename(tmp_path / "hidden.zip")
+    try:
+        with pytest.raises(ValueError, match=r"holds no final model \(Nav2D-v0.zip\); let the run end first"):
+            film(run_folder, tmp_path / "a.gif")
+    finally:
+        hidden.rename(model)
