@@ -44,6 +44,7 @@ check: lint type test  ## all of the above that must be green
 bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
 	$(BIN)/python -m benchmarks.bench_envs
 	$(BIN)/python -m benchmarks.bench_pretrain
+	$(BIN)/python -m benchmarks.bench_memory
 	$(BIN)/python -m benchmarks.bench_frozen
 	$(BIN)/python -m benchmarks.bench_scan
 

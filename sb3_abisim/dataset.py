@@ -35,8 +35,8 @@ VERIFY_BELOW_BYTES = 4 * 10**9
 # Files whose hash this process has found right: (path, size, time of the last change, sha256).
 _VERIFIED: set[tuple[str, int, int, str]] = set()
 # Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbours with it, so
-# that many times as much can be resident meanwhile. Pages stay in its cache: reading them again is cheap.
-RELEASE_AFTER_BYTES = 64 * 2**20
+# that up to twenty times as much was resident meanwhile. Pages stay in its cache: reading them again is cheap.
+RELEASE_AFTER_BYTES = 16 * 2**20
 # Which segments are held out is a property of the dataset, not of a run.
 _HOLDOUT_SEED = 20240229
 
@@ -283,10 +283,11 @@ class TransitionDataset:
         bounds = np.searchsorted(ascending, self._offsets)
         for shard in np.flatnonzero(np.diff(bounds)):
             here = slice(bounds[shard], bounds[shard + 1])
-            out[order[here]] = self._shard(name, int(shard))[ascending[here] - self._offsets[shard]]
-        self._bytes_read += out.nbytes
-        if self._bytes_read > RELEASE_AFTER_BYTES:
-            self._release_pages()
+            part = self._shard(name, int(shard))[ascending[here] - self._offsets[shard]]
+            out[order[here]] = part
+            self._bytes_read += part.nbytes
+            if self._bytes_read > RELEASE_AFTER_BYTES:
+                self._release_pages()
         return out
 
     def _release_pages(self) -> None:

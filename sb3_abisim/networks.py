@@ -84,7 +84,8 @@ class Encoder(nn.Module):
         :param observations: float (batch, channels, height, width) in 0..1, many enough for a mean
         :raises ValueError: if the embedding is the same for all of them
         """
-        embeddings = self(observations)
+        # In parts: the first layers' activations are many times as large as the embedding.
+        embeddings = th.cat([self(part) for part in observations.split(256)])
         variance = embeddings.var(dim=0, correction=0).mean()
         if not float(variance) > 0:
             raise ValueError("the embedding is the same for all observations: nothing was learned, or it has collapsed")
