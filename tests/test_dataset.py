@@ -148,6 +148,18 @@ def test_pages_that_were_read_are_given_back(
     np.testing.assert_array_equal(dataset.frames(np.arange(dataset.n_frames)), frames)
 
 
+def test_pages_are_given_back_within_a_large_read(dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = dataset.frames(np.array([0])).nbytes
+    monkeypatch.setattr(dataset_module, "RELEASE_AFTER_BYTES", 50 * row)
+    times = []
+    monkeypatch.setattr(
+        dataset, "_release_pages", lambda: (times.append(dataset._bytes_read), setattr(dataset, "_bytes_read", 0))
+    )
+    dataset.frames(np.arange(dataset.n_frames))
+    largest = max(shard["n_frames"] for shard in dataset.meta["shards"])
+    assert len(times) > 1 and all(50 * row < read <= (50 + largest) * row for read in times)
+
+
 def test_too_large_k_names_the_longest_segment(dataset: TransitionDataset) -> None:
     with pytest.raises(ValueError, match=rf"k = {index_env.LIMIT + 1} .* longest has {index_env.LIMIT}"):
         dataset.valid_starts(index_env.LIMIT + 1)
