@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow format lint type check bench figures benchmark benchmark-smoke clean
+.PHONY: help setup demo test test-slow format lint type check docs bench figures benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -40,6 +40,9 @@ type: setup  ## mypy in strict mode
 	$(BIN)/python -m mypy sb3_abisim
 
 check: lint type test  ## all of the above that must be green
+
+docs: setup  ## the pages of docs/ as a site with the API's reference, into site/
+	$(BIN)/python -m mkdocs build --strict
 
 bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
 	$(BIN)/python -m benchmarks.bench_envs
