@@ -85,7 +85,7 @@ class Encoder(nn.Module):
         :raises ValueError: if the embedding is the same for all of them
         """
         # In parts: the first layers' activations are many times as large as the embedding.
-        embeddings = th.cat([self(part) for part in observations.split(256)])
+        embeddings = th.cat([self(part) for part in th.split(observations, 256)])
         variance = embeddings.var(dim=0, correction=0).mean()
         if not float(variance) > 0:
             raise ValueError("the embedding is the same for all observations: nothing was learned, or it has collapsed")

@@ -237,8 +237,11 @@ def _in_lockstep(vec_env_class: type) -> type:
     return importlib.import_module("sb3_abisim.lockstep").LockstepVecEnv if is_default else vec_env_class
 
 
-def _encoding_kwargs(hyperparams: dict[str, Any]) -> dict[str, Any] | None:
-    """The arguments of ``VecEncodeObservations`` in a zoo entry, None where it is not used."""
+def encoding_kwargs(hyperparams: dict[str, Any]) -> dict[str, Any] | None:
+    """The arguments of ``VecEncodeObservations`` in a zoo entry, None where it is not used.
+
+    :param hyperparams: of a zoo entry, or of a run's ``config.yml``
+    """
     wrappers = hyperparams.get("vec_env_wrapper")
     for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
         if isinstance(wrapper, dict) and ENCODING_WRAPPER in wrapper:
@@ -251,7 +254,7 @@ def _config_saver(original: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(original)
     def _save_config(self: Any, saved_hyperparams: dict[str, Any]) -> None:
         original(self, saved_hyperparams)
-        kwargs = _encoding_kwargs(saved_hyperparams)
+        kwargs = encoding_kwargs(saved_hyperparams)
         if kwargs is not None:
             checkpoint = importlib.import_module("sb3_abisim.checkpoint")
             copied = Path(self.params_path) / checkpoint.RUN_COPY
@@ -264,7 +267,7 @@ def _saved_reader(original: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(original)
     def get_saved_hyperparams(stats_path: str, *args: Any, **kwargs: Any) -> Any:
         hyperparams, found = original(stats_path, *args, **kwargs)
-        encoding = _encoding_kwargs(hyperparams)
+        encoding = encoding_kwargs(hyperparams)
         if encoding is not None:
             copied = Path(stats_path) / importlib.import_module("sb3_abisim.checkpoint").RUN_COPY
             if copied.is_file():

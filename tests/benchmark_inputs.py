@@ -20,12 +20,15 @@ def write_run(
     final: dict[str, np.ndarray] | None = None,
     n_timesteps: int | None = None,
 ) -> Path:
-    """``returns`` has shape (len(steps), n_episodes); ``final`` is e.g. {"deterministic/eval": array of returns}."""
+    """``returns`` has shape (len(steps), n_episodes); ``final`` is e.g. {"deterministic/eval": array of returns}.
+
+    ``method`` is as in ``--conf-file``, or ends in ",freeze" for an extractor that is frozen within the policy.
+    """
     number = 1 + sum(1 for _ in (folder / algo).glob(f"{env_id}_*"))
     run = folder / algo / f"{env_id}_{number}"
     (run / env_id).mkdir(parents=True)
-    name, _, frozen = method.partition(",")
-    kwargs = {"encoder": f"{name}-{seed}.safetensors", **({"freeze": True} if frozen else {})}
+    name, _, how = method.partition(",")
+    kwargs = {"encoder": f"{name}-{seed}.safetensors", **({"freeze": True} if how == "freeze" else {})}
     shown = f", features_extractor_kwargs={kwargs!r}" if name != "vanilla" else ""
     text = f"dict(features_extractor_class=get_class_by_name('sb3_abisim.extractors.{EXTRACTORS[name]}'){shown})"
     args = {
@@ -35,6 +38,9 @@ def write_run(
     # As rl_zoo3.exp_manager writes them, tags included.
     (run / env_id / "args.yml").write_text(yaml.dump(OrderedDict(sorted(args.items()))))
     config = OrderedDict([("n_timesteps", 7_000_000), ("policy", "CnnPolicy"), ("policy_kwargs", text)])
+    if how == "frozen":
+        wrapper = {"sb3_abisim.vec_env.VecEncodeObservations": {"encoder": kwargs["encoder"], "objective": name}}
+        config |= {"policy": "MlpPolicy", "policy_kwargs": "dict(net_arch=[256])", "vec_env_wrapper": [wrapper]}
     (run / env_id / "config.yml").write_text(yaml.dump(config))
     (run / env_id / "command.txt").write_text(f"python -m sb3_abisim.zoo train --seed {seed}")
     np.savez(run / "evaluations.npz", timesteps=steps, results=returns, ep_lengths=-returns, successes=returns > -100)

@@ -1,8 +1,10 @@
 """What names a cell, and what a changed setting changes."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
+from zoo_inputs import write_encoder
 
 from sb3_abisim.benchmark.graph import Cell, Plan, build, run_labels
 from sb3_abisim.zoo import DISTRACTOR_IDS
@@ -112,6 +114,22 @@ def test_a_given_encoder_is_known_by_its_content() -> None:
     several = build(dataclasses.replace(plan, methods=("ssi", "ssi=Nav2D-v0/ssi", "ssi=Nav2D-v0/ssi,frozen")))
     labels = list(run_labels(several).values())
     assert labels == ["ssi", f"ssi={run.settings['encoder_digest'][:6]}", "ssi,frozen"]
+
+
+def test_given_encoders_of_several_seeds(tmp_path: Path) -> None:
+    for seed in (3, 4):
+        path = tmp_path / ("x" * seed)  # write_encoder draws by the length of the name
+        write_encoder(path, "Nav2D-v0", "ssi")
+        path.rename(tmp_path / f"ssi{seed}")
+    plan = dataclasses.replace(PLAN, env_ids=("Nav2D-v0",), seeds=(0, 1, 2), encoder_seeds=(3, 4))
+    runs = [
+        c for c in build(dataclasses.replace(plan, methods=(f"ssi={tmp_path}/ssi{{seed}},frozen",))) if c.kind == "run"
+    ]
+    files = [word for cell in runs for word in cell.command if word.startswith("ssi=")]
+    assert files == [f"ssi={tmp_path}/ssi{seed},frozen" for seed in (3, 4, 3)]
+    assert set(run_labels(runs).values()) == {"ssi,frozen"}, "one method, not one per file"
+    with pytest.raises(FileNotFoundError, match="ssi5"):
+        build(dataclasses.replace(plan, methods=(f"ssi={tmp_path}/ssi{{seed}}",), encoder_seeds=(5,)))
 
 
 def test_distractors_are_evaluated_on_three_splits() -> None:

@@ -194,11 +194,27 @@ def test_reference_is_the_first_method_where_ours_is_not_there(logs: Path) -> No
 
 
 def test_labels(tmp_path: Path) -> None:
-    for method in ("abisim", "abisim,frozen", "vanilla"):
+    for method in ("abisim", "abisim,frozen", "ssi,freeze", "vanilla"):
         write_run(tmp_path, "PointMaze-v0", method, 0, STEPS, np.zeros((len(STEPS), 1)))
-    assert sorted(run.label for run in find_runs(tmp_path)) == ["abisim", "abisim,frozen", "vanilla"]
+    assert sorted(run.label for run in find_runs(tmp_path)) == ["abisim", "abisim,frozen", "ssi,frozen", "vanilla"]
     groups = compare([f"mine={tmp_path / 'ppo' / 'PointMaze-v0_1'}"], "evaluations", "mine", [0.5]).groups
     assert list(groups["PointMaze-v0"]) == ["mine"]
+
+
+@pytest.mark.parametrize("method", ["abisim", "abisim,frozen", "abisim,freeze"])
+def test_runs_on_encoders_of_several_seeds_are_one_method(tmp_path: Path, method: str) -> None:
+    for seed in range(2):
+        run = write_run(tmp_path, "PointMaze-v0", method, seed, STEPS, np.zeros((len(STEPS), 1)))
+    (groups,) = compare([str(tmp_path)], "evaluations", None, [0.5]).groups.values()
+    assert [len(group.runs) for group in groups.values()] == [2]
+    # Another wrapper is another method.
+    config = run / "PointMaze-v0" / "config.yml"
+    text = config.read_text()
+    if method == "abisim,frozen":
+        config.write_text(text.replace("objective: abisim", "objective: abisim\n          device: cuda"))
+        assert config.read_text() != text
+        with pytest.raises(ValueError, match="differ in vec_env_wrapper"):
+            compare([str(tmp_path)], "evaluations", None, [0.5])
 
 
 def test_what_a_benchmark_works_on_is_no_run_yet(tmp_path: Path) -> None:

@@ -6,12 +6,13 @@ import shutil
 
 import numpy as np
 import pytest
+from zoo_inputs import write_encoder
 
 from sb3_abisim import analyze
 from sb3_abisim.analysis import nav2d_exact, pixels, probes
 from sb3_abisim.analysis.figures import FIGURES, default_encoders
 from sb3_abisim.analysis.sweep import sweep_encoders
-from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.checkpoint import load_encoder, resolve_encoder
 from sb3_abisim.collect import collect
 from sb3_abisim.resources import resource_path
 
@@ -94,11 +95,15 @@ def test_environment_without_shipped_encoders():
 
 
 def test_own_folder_joins_the_shipped_ones(tmp_path):
-    (tmp_path / "Nav2DMaze-v0").mkdir()
-    (tmp_path / "Nav2DMaze-v0/abisim.safetensors").touch()
+    folder = tmp_path / "Nav2DMaze-v0"
+    folder.mkdir()
+    write_encoder(folder / "mine.safetensors", "Nav2D-v0")
+    # A copy of a shipped one would count twice.
+    shutil.copy(resolve_encoder("Nav2D-v0/abisim"), folder / "abisim_0.safetensors")
     shipped = ["Nav2D-v0/ssi", "Nav2D-v0/abisim"]
     assert [name for name in default_encoders("Nav2DMaze-v0") if name in shipped] == shipped
-    assert default_encoders("Nav2DMaze-v0", tmp_path)[-1] == str(tmp_path / "Nav2DMaze-v0/abisim.safetensors")
+    joined = default_encoders("Nav2DMaze-v0", tmp_path)
+    assert joined == [*default_encoders("Nav2DMaze-v0"), str(folder / "mine.safetensors")]
 
 
 def test_all_makes_the_usual_ones(monkeypatch, tmp_path):

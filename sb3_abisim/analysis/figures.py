@@ -90,7 +90,7 @@ FIGURES = {
 
 
 def default_encoders(env_id: str, trained: Path | None = None) -> list[str]:
-    """All encoders that ship for an environment, and those of one's own folder.
+    """All encoders that ship for an environment, and those of one's own folder, copies of shipped ones left out.
 
     :param env_id: a registered id of ours
     :param trained: holds ``<env_id>/*.safetensors``; None for the shipped ones alone
@@ -99,7 +99,9 @@ def default_encoders(env_id: str, trained: Path | None = None) -> list[str]:
     shipped = resource_path("encoders") / SAME_PICTURES.get(env_id, env_id)
     names = [f"{path.parent.name}/{path.stem}" for path in sorted(shipped.glob("*.safetensors"), reverse=True)]
     if trained is not None:
-        names += [str(path) for path in sorted((trained / env_id).glob("*.safetensors"), reverse=True)]
+        there = {load_encoder(name).digest for name in names}
+        paths = sorted((trained / env_id).glob("*.safetensors"), reverse=True)
+        names += [str(path) for path in paths if load_encoder(str(path)).digest not in there]
     if not names:
         raise ValueError(f"no encoder ships for {env_id}; name the files to look at")
     return names

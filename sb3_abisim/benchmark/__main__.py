@@ -49,7 +49,8 @@ def _run_parser() -> argparse.ArgumentParser:
     words = ", ".join(EXTRACTORS)
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
     parser.add_argument("--methods", nargs="+", default=list(EXTRACTORS), metavar="METHOD[=ENCODER][,frozen]",
-                        help=f"of {words}; without an encoder, it is pretrained (default: all)")  # fmt: skip
+                        help=f"of {words}; without an encoder, it is pretrained; {{seed}} in an encoder's name "
+                        "becomes the seed of pretraining (default: all)")  # fmt: skip
     parser.add_argument("--env", nargs="+", default=list(DEFAULT_ENV_IDS), metavar="ID",
                         help=f"of {', '.join(ENV_IDS)} (default: the paper's)")  # fmt: skip
     _add_budget(parser)

@@ -72,7 +72,8 @@ class Cell:
 class Plan:
     """What to compare, and with which budget.
 
-    :param methods: as ``--conf-file`` of :mod:`sb3_abisim.zoo` takes them; without ``=ENCODER``, one is pretrained
+    :param methods: as ``--conf-file`` of :mod:`sb3_abisim.zoo` takes them; without ``=ENCODER``, one is pretrained;
+        ``{seed}`` in it becomes the seed of pretraining, for files of several
     :param env_ids: environments of this package
     :param seeds: of RL, one run each
     :param encoder_seeds: of pretraining; the runs take the encoders in turn, so that five of each are paired
@@ -147,7 +148,8 @@ def build(plan: Plan) -> list[Cell]:
         for env_id in plan.env_ids:
             for method in plan.methods:
                 encoder_seed = plan.encoder_seeds[i % len(plan.encoder_seeds)]
-                run = run_cell(plan, env_id, Method.parse(method), seed, encoder_seed)
+                named = Method.parse(method.replace("{seed}", str(encoder_seed)))
+                run = run_cell(plan, env_id, named, seed, encoder_seed)
                 add(final_cell(plan, run) if plan.final_episodes else run)
     return list(cells.values())
 
@@ -228,16 +230,17 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
 
 
 def run_labels(cells: list[Cell]) -> dict[str, str]:
-    """What a report calls the runs: their method, and the encoder where the method has several given ones.
+    """What a report calls the runs: their method, and the encoder where one seed has several given ones of the method.
 
     :param cells: what :func:`build` made
     :return: name of each run's cell to its label
     """
     runs = [cell for cell in cells if cell.kind == "run"]
-    given: dict[tuple[str, str], set[str]] = {}
+    given: dict[tuple[str, str, int], set[str]] = {}
     for run in runs:
-        given.setdefault((_method(run), run.settings["env_id"]), set()).add(run.settings.get("encoder_digest", ""))
-    several = {method for (method, _), digests in given.items() if len(digests) > 1}
+        same = (_method(run), run.settings["env_id"], run.settings["seed"])
+        given.setdefault(same, set()).add(run.settings.get("encoder_digest", ""))
+    several = {method for (method, _, _), digests in given.items() if len(digests) > 1}
     labels = {}
     for run in runs:
         digest = run.settings.get("encoder_digest")

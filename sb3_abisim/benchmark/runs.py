@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from sb3_abisim.zoo import EXTRACTORS
+from sb3_abisim.zoo import EXTRACTORS, encoding_kwargs
 
 
 class _Loader(yaml.SafeLoader):
@@ -124,10 +124,11 @@ def read_run(folder: str | Path) -> Run:
         command = found[0].with_name("command.txt")
         # What names the encoder's file differs between encoder seeds; the label says whatever else is in there.
         plain = {name: value for name, value in config.items() if name not in ("policy_kwargs", "n_timesteps")}
+        (encoding_kwargs(plain) or {}).pop("encoder", None)
         names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
         return Run(
             folder=folder,
-            label=_label(str(config.get("policy_kwargs", "")), str(args["algo"])),
+            label=_label(config, str(args["algo"])),
             env_id=args["env"],
             algo=args["algo"],
             seed=int(args["seed"]),
@@ -186,7 +187,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         raise ValueError(f"cannot read {path} ({error}); was it written by rl_zoo3.train?") from error
 
 
-def _label(policy_kwargs: str, algo: str) -> str:
+def _label(config: dict[str, Any], algo: str) -> str:
+    encoding = encoding_kwargs(config)
+    if encoding is not None:
+        return f"{encoding.get('objective') or algo},frozen"
+    policy_kwargs = str(config.get("policy_kwargs", ""))
     for method, class_name in EXTRACTORS.items():
         if re.search(rf"\b{class_name}\b", policy_kwargs):
             return method + (",frozen" if re.search(r"['\"]?freeze['\"]?\s*[:=]\s*True", policy_kwargs) else "")
