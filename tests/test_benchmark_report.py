@@ -191,6 +191,8 @@ def test_an_end_where_nothing_was_learnt_is_said_to_be_one(tmp_path: Path) -> No
 def test_reference_is_the_first_method_where_ours_is_not_there(logs: Path) -> None:
     folders = [str(logs / "vanilla"), str(logs / "ssi")]
     assert compare(folders).reference == "vanilla" and compare([*folders, str(logs / "abisim")]).reference == "abisim"
+    assert compare([folders[0], f"abisim,frozen={logs / 'ssi'}"]).reference == "abisim,frozen"
+    assert compare([f"abisim,frozen={logs / 'ssi'}", f"abisim={logs / 'vanilla'}"]).reference == "abisim"
 
 
 def test_labels(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,7 @@ def compare(
 
     :param folders: each a folder, or ``LABEL=FOLDER`` to call all runs below it LABEL
     :param source: "evaluations" (the zoo's, during training) or "training" (the training episodes themselves)
-    :param reference: label of the method to compare with the others; None takes abisim, or else the first
+    :param reference: label of the method to compare with the others; None takes abisim (or abisim,frozen), else the first
     :param thresholds: normalised returns, between 0 and 1, or labels: the mean return that this method ends with; None
         takes 0.5, 0.7, 0.9 and, where there are such runs, vanilla
     :param seed: of the bootstrap
@@ -121,7 +122,9 @@ def compare(
     runs = _labelled_runs(folders)
     labels = list(dict.fromkeys(run.label for run in runs))
     if reference is None:
-        reference = DEFAULT_REFERENCE if DEFAULT_REFERENCE in labels else labels[0]
+        # "abisim" itself, else "abisim,frozen" or "abisim=...".
+        ours = sorted(label for label in labels if re.split("[=,]", label)[0] == DEFAULT_REFERENCE)
+        reference = ours[0] if ours else labels[0]
     if reference not in labels:
         raise ValueError(f"no runs of the reference {reference!r} among {', '.join(labels)}; give --reference")
     if thresholds is None:

@@ -42,7 +42,8 @@ def report(
     :param folders: as for :func:`~sb3_abisim.benchmark.comparison.compare`
     :param output: folder for the files; None for ``report`` in the first of ``folders``
     :param source: "evaluations" or "training"
-    :param reference: label of the method that the others are compared with; None takes abisim, or else the first
+    :param reference: label of the method that the others are compared with; None takes abisim (or
+        abisim,frozen), else the first
     :param thresholds: normalised returns, or methods whose last return is meant; None for the usual ones
     :param seed: of the bootstrap
     :return: the page
