@@ -108,7 +108,7 @@ def compare(
 
     :param folders: each a folder, or ``LABEL=FOLDER`` to call all runs below it LABEL
     :param source: "evaluations" (the zoo's, during training) or "training" (the training episodes themselves)
-    :param reference: label of the method to compare with the others; None takes abisim (or abisim,frozen), else the first
+    :param reference: label of the method to compare with the others; None takes abisim, frozen or not, else the first
     :param thresholds: normalised returns, between 0 and 1, or labels: the mean return that this method ends with; None
         takes 0.5, 0.7, 0.9 and, where there are such runs, vanilla
     :param seed: of the bootstrap

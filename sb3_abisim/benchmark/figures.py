@@ -95,7 +95,10 @@ def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
         axis.locator_params(axis="x", nbins=5)
     axes[0, 0].set_ylabel("return")
     handles = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend([handles[name] for name in colours], list(colours), loc="outside lower center", ncols=len(colours))
+    # About 0.7 inches for an entry's line and 0.1 for each letter; what does not fit into one row takes several.
+    per_row = int(figure.get_figwidth() / (0.7 + 0.1 * max(map(len, colours))))
+    ncols = max(1, min(per_row, len(colours)))
+    figure.legend([handles[name] for name in colours], list(colours), loc="outside lower center", ncols=ncols)
     return figure
 
 
