@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 from PIL import Image
 from stable_baselines3 import PPO
 from zoo_inputs import SMALL
@@ -59,6 +60,17 @@ def test_the_same_seed_films_the_same(run_folder, tmp_path):
         film(run_folder, tmp_path / name, n_episodes=1, seed=5)
     film(run_folder, tmp_path / "c", n_episodes=1, seed=6)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() != (tmp_path / "c").read_bytes()
+
+
+def test_the_seed_is_that_of_the_actions_too(run_folder, tmp_path, monkeypatch):
+    drawn = {}
+    for seed in (5, 6):
+        numbers = drawn[seed] = []
+        monkeypatch.setattr(
+            PPO, "predict", lambda *a, numbers=numbers, **k: (numbers.append(float(th.rand(()))) or np.int64(0), None)
+        )
+        film(run_folder, tmp_path / "a.gif", n_episodes=1, seed=seed)
+    assert drawn[5][0] != drawn[6][0]
 
 
 @pytest.mark.parametrize(
