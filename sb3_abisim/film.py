@@ -1,7 +1,6 @@
 """A GIF of the agent that a zoo run ended with: ``python -m sb3_abisim.film RUN -o agent.gif``.
 
-rl-zoo3's ``record_video`` makes an MP4, of what a model trained on embeddings sees, too. This shows pictures that a
-README or a browser plays without anything installed.
+rl-zoo3's ``record_video`` makes an MP4. A GIF plays in a README and in any browser.
 """
 
 import argparse
