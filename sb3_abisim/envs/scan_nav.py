@@ -27,10 +27,11 @@ class ScanNavVectorEnv(BatchEnv):
     """Walk to the middle of the picture in scanned places; ``num_envs`` copies. ``ScanNavEnv`` is the batch of one.
 
     **Observation.** What an orthographic camera above the goal sees, north up, the goal in the middle, the agent drawn
-    as a yellow marker. ``obs_mode="rgbd"``: ``Box(0, 255, (4, image_size, image_size), uint8)``, red, green, blue, and
-    depth as 255 (3 m - z) / 3 m for a surface z above the floor; where there is no surface all are 0. ``"rgb"``: the
-    first three. ``"dict"``: Habitat's form, ``rgb`` uint8 (image_size, image_size, 3) and ``depth`` float32
-    (image_size, image_size, 1) in 0..1, metres below the camera (at 3 m) divided by 10. The depth has no marker.
+    as a yellow marker with a magenta nose. ``obs_mode="rgbd"``: ``Box(0, 255, (4, image_size, image_size), uint8)``,
+    red, green, blue, and depth as 255 (3 m - z) / 3 m for a surface z above the floor; where there is no surface all
+    are 0. ``"rgb"``: the first three. ``"dict"``: Habitat's form, ``rgb`` uint8 (image_size, image_size, 3) and
+    ``depth`` float32 (image_size, image_size, 1) in 0..1, metres below the camera (at 3 m) divided by 10. The depth
+    has no marker.
 
     **Action.** ``Discrete(4)``: stop, move forward 0.25 m, turn left 10 degrees, turn right 10 degrees.
     ``stop="auto"``: ``Discrete(3)``, without stop. The border of the view is a wall.
@@ -59,7 +60,7 @@ class ScanNavVectorEnv(BatchEnv):
     :param image_size: pixels per side, even, at least 32
     :param view_size: metres per side
     :param obs_mode: "rgbd", "dict" or "rgb"
-    :param marker: "arrow", which shows the heading, or "box", the paper's
+    :param marker: "arrow", whose nose shows the heading, or "box", the paper's plain square
     :param stop: "action" or "auto"
     :param forward_step: in m
     :param turn_angle: in degrees
@@ -126,7 +127,7 @@ class ScanNavVectorEnv(BatchEnv):
             render_mode,
             autoreset,
         )
-        self.obs_mode, self.stop, self.image_size = obs_mode, stop, image_size
+        self.obs_mode, self.marker, self.stop, self.image_size = obs_mode, marker, stop, image_size
         self.forward_step, self.turn_angle, self.allow_sliding = forward_step, turn_angle, allow_sliding
         self.success_distance, self.slack_reward, self.success_reward = success_distance, slack_reward, success_reward
         self._pitch = view_size / image_size
@@ -147,8 +148,9 @@ class ScanNavVectorEnv(BatchEnv):
 
     @property
     def fingerprint(self) -> str:
-        """sha256 over the maps."""
-        return hashlib.sha256("".join(scan.fingerprint for scan in self.scans).encode()).hexdigest()
+        """sha256 over the maps and the agent's marker."""
+        parts = [scan.fingerprint for scan in self.scans] + [repr(MARKERS[self.marker])]
+        return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     # Episodes.
 
@@ -336,7 +338,7 @@ class ScanNavEnv(SingleEnv):
 
     @property
     def fingerprint(self) -> str:
-        """sha256 over the maps."""
+        """sha256 over the maps and the agent's marker."""
         # Behind LockstepVecEnv the batch is one row of another, which passes this on.
         return str(self.batch.fingerprint)  # type: ignore[attr-defined]
 

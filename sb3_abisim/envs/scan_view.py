@@ -1,5 +1,7 @@
 """Frames of ScanNav: parts of one large picture, with the agent drawn on them."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,11 +9,15 @@ from sb3_abisim.envs.scan_map import ScanMap
 
 CAMERA_HEIGHT = 3.0  # m above the floor
 MAX_DEPTH = 10.0  # m, Habitat's
-AGENT_COLOUR = (255, 214, 0)
-# Corners of the agent's marker, in m: ahead of its centre and to its left, counter-clockwise.
-MARKERS = {
-    "arrow": ((0.24, 0.0), (-0.18, 0.17), (-0.18, -0.17)),
-    "box": ((0.14, 0.14), (-0.14, 0.14), (-0.14, -0.14), (0.14, -0.14)),
+YELLOW, MAGENTA = (255, 214, 0), (255, 0, 200)
+_OCTAGON = tuple((0.13 * math.cos(a), 0.13 * math.sin(a)) for a in (math.pi * (k + 0.5) / 4 for k in range(8)))
+# The agent's marker: convex parts, a later one over an earlier. Of each its colour and its corners in m, ahead of the
+# agent's centre and to its left, counter-clockwise. The body of the arrow is as good as round, its nose has a colour of
+# its own. Which way a plain triangle turns can be seen from its direction modulo 120 degrees: inverse dynamics had
+# no use for more, and agents on such encoders did not know ahead from behind (docs/scan_nav.md).
+MARKERS: dict[str, tuple[tuple[tuple[int, int, int], tuple[tuple[float, float], ...]], ...]] = {
+    "arrow": ((YELLOW, _OCTAGON), (MAGENTA, ((0.24, 0.06), (0.1, 0.06), (0.1, -0.06), (0.24, -0.06)))),
+    "box": ((YELLOW, ((0.14, 0.14), (-0.14, 0.14), (-0.14, -0.14), (0.14, -0.14))),),
 }
 MARKER_RADIUS = 0.25  # m, no marker is larger
 # A pixel's share of the marker is counted on this many points per side.
@@ -65,7 +71,7 @@ def area_means(picture: NDArray[np.float64], ratio: float) -> NDArray[np.float64
 
 
 class MarkerPainter:
-    """Draws the agent, a convex polygon that turns with it, into the colours of frames.
+    """Draws the agent, convex polygons that turn with it, into the colours of frames.
 
     :param marker: a key of :data:`MARKERS`
     :param image_size: of the frames
@@ -73,19 +79,7 @@ class MarkerPainter:
     """
 
     def __init__(self, marker: str, image_size: int, pitch: float) -> None:
-        corners = np.array(MARKERS[marker]) / pitch
-        following = np.roll(corners, -1, axis=0)
-        along = following - corners
-        # A point p is inside where each normal . p + offset is positive.
-        self._normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        self._offsets = -(self._normals * corners).sum(axis=1)[:, None]
-        self._radius = MARKER_RADIUS / pitch
-        self._size = int(np.ceil(2 * self._radius)) + 1
-        self._image_size = image_size
-        self._points = (np.arange(self._size * SAMPLES) + 0.5) / SAMPLES
-        steps = np.arange(self._size)[:, None] * image_size + np.arange(self._size)
-        self._where = np.arange(3)[:, None, None] * image_size**2 + steps
-        self._colour = np.array(AGENT_COLOUR, dtype=np.uint32)[:, None, None]
+        self._parts = [_PartPainter(colour, corners, image_size, pitch) for colour, corners in MARKERS[marker]]
 
     def draw(self, frames: NDArray[np.uint8], centres: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
         """Draw one marker into each frame, in place.
@@ -94,6 +88,29 @@ class MarkerPainter:
         :param centres: (column, row) in pixels, at least the marker's radius and two pixels from the border
         :param headings: in degrees, 0 is up and 90 is left
         """
+        for part in self._parts:
+            part.draw(frames, centres, headings)
+
+
+class _PartPainter:
+    def __init__(
+        self, colour: tuple[int, int, int], corners_in_m: tuple[tuple[float, float], ...], image_size: int, pitch: float
+    ) -> None:
+        corners = np.array(corners_in_m) / pitch
+        following = np.roll(corners, -1, axis=0)
+        along = following - corners
+        # A point p is inside where each normal . p + offset is positive.
+        self._normals = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        self._offsets = -(self._normals * corners).sum(axis=1)[:, None]
+        self._radius = float(np.hypot(*corners.T).max())
+        self._size = int(np.ceil(2 * self._radius)) + 1
+        self._image_size = image_size
+        self._points = (np.arange(self._size * SAMPLES) + 0.5) / SAMPLES
+        steps = np.arange(self._size)[:, None] * image_size + np.arange(self._size)
+        self._where = np.arange(3)[:, None, None] * image_size**2 + steps
+        self._colour = np.array(colour, dtype=np.uint32)[:, None, None]
+
+    def draw(self, frames: NDArray[np.uint8], centres: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
         corner = np.floor(centres - self._radius).astype(np.int64)
         points = corner[:, :, None] + self._points - centres[:, :, None]
         angle = np.deg2rad(headings)[:, None]
