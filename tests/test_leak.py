@@ -5,7 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
-from sb3_abisim.analysis.leak import ActionLeakWarning, audit, leak_maps, paint_action
+from sb3_abisim.analysis.leak import N_PATCHES, ActionLeakWarning, audit, leak_maps, paint_action
+from sb3_abisim.networks import ENCODERS
 
 GENERATOR = np.random.default_rng(0)
 
@@ -41,6 +42,11 @@ def test_nav2d_leaks_only_with_a_display():
         results = leak_maps("Nav2D-v0", 60)["audits"]
     plain, display = results.values()
     assert not plain["leaks"] and display["leaks"] and display["best"] == (0, 0)
+
+
+def test_all_our_pictures_have_patches():
+    sides = {network.observation_shape[-1] for network in ENCODERS.values()}
+    assert sides == set(N_PATCHES) and all(side % N_PATCHES[side] == 0 for side in sides)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from analysis_inputs import Masked, file_of, identity
 from torch import nn
 
 from sb3_abisim.analysis import probes as module
+from sb3_abisim.analysis.pixels import clip_settings
 from sb3_abisim.analysis.probes import (
     Target,
     by_objective,
@@ -55,6 +56,22 @@ def test_targets_are_those_that_vary():
     assert set(found) == {"agent", "obstacles", "clip", "phase"}
     np.testing.assert_array_equal(found["clip"].values.argmax(axis=1), samples.factors["clip"])
     assert 0 <= found["phase"].values.min() < 0.3 and 0.7 < found["phase"].values.max() <= 1
+
+
+def test_targets_in_a_scan():
+    """The position in the picture and the heading, both of the state before the step; episodes do not end at once."""
+    samples = sample_episodes("ScanNav-v0", 3, 10, env_kwargs=clip_settings("ScanNav-v0")["other episodes"])
+    assert len(samples) == 30
+    found = targets(samples)
+    assert set(found) == {"agent", "heading"}
+    east, north = found["agent"].values.T * 128 / 6
+    ahead = found["heading"].values
+    for k, frame in enumerate(samples.frames.astype(int)):
+        # The nose is the only magenta thing.
+        rows, columns = np.nonzero((frame[0] > 200) & (frame[1] < 60) & (frame[2] > 150))
+        # 0.17 m ahead of the agent; a heading of 0 is up and of 90 is left.
+        nose = np.array([columns.mean() + 0.5 - 64 - east[k], 64 - rows.mean() - 0.5 - north[k]])
+        assert np.abs(nose - 0.17 * 128 / 6 * np.array([-ahead[k, 1], ahead[k, 0]])).max() < 1.0
 
 
 def test_interval_by_hand():

@@ -18,8 +18,8 @@ from sb3_abisim.analysis.scenes import sample_episodes
 
 # A score (0 chance, 1 certainty) from which one patch alone counts as a leak.
 THRESHOLD = 0.5
-# Patches per side of the picture: each is 1/256 of a point maze, 1/25 of Nav2D.
-N_PATCHES = {64: 16, 15: 5}
+# Patches per side of the picture, by its size: each is 1/256 of a point maze or scan, 1/25 of Nav2D.
+N_PATCHES = {15: 5, 64: 16, 128: 16, 256: 16}
 MAX_DEPTH = 8
 PER_EPISODE = 10
 DISPLAY = 2  # pixels of the painted display, per side

@@ -60,9 +60,18 @@ class Target:
 def targets(samples: Samples) -> dict[str, Target]:
     """What is to be read from a picture; goals that never move and clips that are not shown are left out.
 
+    In ScanNav, whose camera hangs above the goal, the agent's position is that in the picture, and its heading is
+    cosine and sine; its scans are no lists of obstacles.
+
     :param samples: with factors
     """
     factors = samples.factors
+    if "heading" in factors:
+        angle = np.deg2rad(factors["heading"].astype(np.float64))
+        return {
+            "agent": Target((factors["agent"] - factors["goal"]).astype(np.float64), "continuous"),
+            "heading": Target(np.stack([np.cos(angle), np.sin(angle)], axis=1), "continuous"),
+        }
     found = {
         "agent": Target(factors["agent"].astype(np.float64), "continuous"),
         "obstacles": Target(local_obstacles(factors).astype(np.float64), "binary"),
