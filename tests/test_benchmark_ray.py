@@ -10,6 +10,7 @@ import pytest
 from sb3_abisim.benchmark.engine import run_cells
 from sb3_abisim.benchmark.graph import Cell, Plan, build
 from sb3_abisim.benchmark.ray_engine import RayEngine, _execute
+from sb3_abisim.benchmark.sweep import sweep
 
 # Ray's own programs leave sockets and files open.
 pytestmark = [
@@ -76,3 +77,29 @@ def test_a_killed_node_costs_its_cell_another_start_and_nothing_else(
         assert not list(tmp_path.glob("work/*")), "nothing half done is left"
     finally:
         cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_a_sweep_takes_a_fresh_engine_for_each_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+    from ray.cluster_utils import Cluster
+
+    plan = Plan(
+        methods=("ssi",), env_ids=("Nav2D-v0",), seeds=(0,), encoder_seeds=(0,), n_transitions=1000, n_timesteps=400,
+        eval_freq=200, eval_episodes=2, final_episodes=0, params=("dqn.learning_starts:100",), device="cpu",
+        pretrain_params=("n_updates:4", "log_interval:2", "checkpoint_interval:2"),
+    )  # fmt: skip
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    engines: list[RayEngine] = []
+
+    def make_engine() -> RayEngine:
+        engines.append(RayEngine(address=cluster.address))
+        return engines[-1]
+
+    try:
+        trials = sweep(tmp_path, plan, ["batch_size=16..64"], n_trials=2, make_engine=make_engine)
+    finally:
+        cluster.shutdown()
+    assert len(engines) == 2 and all(len(trial.returns) == 1 for trial in trials)
+    assert trials[0].params != trials[1].params
