@@ -63,7 +63,7 @@ def test_targets_in_a_scan():
     samples = sample_episodes("ScanNav-v0", 3, 10, env_kwargs=clip_settings("ScanNav-v0")["other episodes"])
     assert len(samples) == 30
     found = targets(samples)
-    assert set(found) == {"agent", "heading"}
+    assert set(found) == {"agent", "obstacles", "heading"}
     east, north = found["agent"].values.T * 128 / 6
     ahead = found["heading"].values
     for k, frame in enumerate(samples.frames.astype(int)):

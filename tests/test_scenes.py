@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sb3_abisim.analysis.pixels import backgrounds_of, clips_of, swapped_backgrounds
-from sb3_abisim.analysis.scenes import draw_point_mazes, local_obstacles, sample_episodes
+from sb3_abisim.analysis.scenes import draw_point_mazes, local_obstacles, position_in_picture, sample_episodes
 from sb3_abisim.envs import top_down
 from sb3_abisim.envs.nav2d import MOVES, SIZE
 from sb3_abisim.envs.point_maze import to_pixels
@@ -72,6 +72,22 @@ def test_surroundings_in_the_point_mazes_are_what_is_seen():
                 assert seen[line, column] == value
                 n_checked += 1
     assert n_checked > 400 and 0.1 < blocked.mean() < 0.9
+
+
+def test_surroundings_in_the_flats_are_what_the_depth_shows():
+    samples = sample_episodes("ScanNav-v0", 20, 5, env_kwargs={"stop": "auto"})
+    blocked = local_obstacles(samples.factors)
+    offsets = [(dx, dy) for dy in (-2, -1, 0, 1, 2) for dx in (-2, -1, 0, 1, 2) if (dx, dy) != (0, 0)]
+    free, solid = [], []
+    for frame, agent, row in zip(samples.frames, position_in_picture(samples.factors), blocked, strict=True):
+        for (dx, dy), value in zip(offsets, row, strict=True):
+            column = int(np.floor(64 + (agent[0] + 0.25 * dx) * 128 / 6))
+            line = int(np.floor(64 - (agent[1] + 0.25 * dy) * 128 / 6))
+            if 0 <= column < 128 and 0 <= line < 128:
+                (solid if value else free).append(frame[3, line, column])
+    # One can stand on what is lower than 0.2 m; a wall's neighbourhood is blocked, too, so floor is among the blocked.
+    assert len(free) > 300 and np.mean(np.array(free) >= 255 * (1 - 0.2 / 3)) > 0.995
+    assert len(solid) > 300 and np.mean(np.array(solid) < 200) > 0.4
 
 
 @pytest.mark.parametrize("env_id", ["PointMaze-v0", "ContinuousPointMaze-v0"])

@@ -19,8 +19,6 @@ from sb3_abisim.resources import resource_path
 NAV2D_IDS = ("Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0")
 SHIPPED_IDS = ("Nav2D-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "DistractorPointMaze-v0")
 ALL_IDS = ("DistractorPointMaze-v0", *(key for key in ENV_IDS if key != "DistractorPointMaze-v0"))
-# A scan is no list of obstacles, so what surrounds the agent there cannot be compared.
-MAZE_IDS = tuple(key for key in ALL_IDS if not key.startswith("ScanNav"))
 # Environments without shipped encoders that show the pictures of one that has some.
 SAME_PICTURES = {"Nav2DCorridor-v0": "Nav2D-v0", "Nav2DMaze-v0": "Nav2D-v0"}
 
@@ -72,7 +70,7 @@ FIGURES = {
         ("PointMaze-v0", "DistractorPointMaze-v0"), 1500, "states", pixels.pixel_maps, plots_pixels.draw_pixel_maps,
     ),
     "neighbours": Figure(
-        "nearest neighbours in embedding space", MAZE_IDS, MAZE_IDS[:1], 500, "episodes", neighbours.neighbours,
+        "nearest neighbours in embedding space", ALL_IDS, ALL_IDS[:1], 500, "episodes", neighbours.neighbours,
         plots_pixels.draw_neighbours,
     ),
     "probes": Figure(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
 from sb3_abisim.analysis.pixels import clip_settings
-from sb3_abisim.analysis.scenes import Samples, local_obstacles, sample_episodes
+from sb3_abisim.analysis.scenes import Samples, local_obstacles, position_in_picture, sample_episodes
 from sb3_abisim.checkpoint import EncoderFile
 
 PER_EPISODE = 10
@@ -106,7 +106,7 @@ def similarity(samples: Samples, partners: NDArray[np.int64]) -> dict[str, Any]:
 
 
 def _pair_numbers(samples: Samples, first: NDArray[np.int64], second: NDArray[np.int64]) -> dict[str, Any]:
-    agents = samples.factors["agent"].astype(np.float64)
+    agents = position_in_picture(samples.factors)
     blocked = local_obstacles(samples.factors)
     clips = samples.factors.get("clip_id")
     return {

@@ -72,7 +72,7 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
     )
     for row, name in zip(axes, rows, strict=True):
         for axis, (setting, k) in zip(row, columns, strict=True):
-            axis.imshow(pictures[setting][name][k].transpose(1, 2, 0))
+            axis.imshow(pictures[setting][name][k][:3].transpose(1, 2, 0))
             axis.set_xticks([])
             axis.set_yticks([])
             if name == "query":

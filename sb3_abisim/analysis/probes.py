@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
 from sb3_abisim.analysis.pixels import backgrounds_of, clip_settings, clips_of, swapped_backgrounds
-from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, local_obstacles, sample_episodes
+from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, local_obstacles, position_in_picture, sample_episodes
 from sb3_abisim.checkpoint import EncoderFile
 from sb3_abisim.networks import Encoder, make_encoder
 
@@ -60,23 +60,19 @@ class Target:
 def targets(samples: Samples) -> dict[str, Target]:
     """What is to be read from a picture; goals that never move and clips that are not shown are left out.
 
-    In ScanNav, whose camera hangs above the goal, the agent's position is that in the picture, and its heading is
-    cosine and sine; its scans are no lists of obstacles.
+    A heading is read as cosine and sine.
 
     :param samples: with factors
     """
     factors = samples.factors
-    if "heading" in factors:
-        angle = np.deg2rad(factors["heading"].astype(np.float64))
-        return {
-            "agent": Target((factors["agent"] - factors["goal"]).astype(np.float64), "continuous"),
-            "heading": Target(np.stack([np.cos(angle), np.sin(angle)], axis=1), "continuous"),
-        }
     found = {
-        "agent": Target(factors["agent"].astype(np.float64), "continuous"),
+        "agent": Target(position_in_picture(factors), "continuous"),
         "obstacles": Target(local_obstacles(factors).astype(np.float64), "binary"),
     }
-    if "goal" in factors and factors["goal"].std(axis=0).max() > 0:
+    if "heading" in factors:
+        angle = np.deg2rad(factors["heading"].astype(np.float64))
+        found["heading"] = Target(np.stack([np.cos(angle), np.sin(angle)], axis=1), "continuous")
+    elif "goal" in factors and factors["goal"].std(axis=0).max() > 0:
         found["goal"] = Target(factors["goal"].astype(np.float64), "continuous")
     clips = clips_of(samples)
     if clips is not None:

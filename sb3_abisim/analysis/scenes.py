@@ -13,11 +13,14 @@ from sb3_abisim.envs.backgrounds import composite
 from sb3_abisim.envs.base import BatchEnv
 from sb3_abisim.envs.nav2d import SIZE
 from sb3_abisim.envs.point_maze import PIXELS_PER_METRE, ROOM_SIZE, to_pixels
+from sb3_abisim.envs.scan_apartment import SEEDS
+from sb3_abisim.envs.scan_map import ScanMap
 
 # Copies collected at once; 64 x 64 pictures of a whole episode take 1.6 MB.
 N_COPIES = 50
-# Points around the agent, this many cells (or metres) in each direction.
+# Points around the agent, this many cells, metres or steps in each direction.
 LOCAL_REACH = 2
+SCAN_STEP = 0.25  # m, ScanNav's step forward
 _HALF_OBSTACLE = point_maze.OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
 
 
@@ -85,10 +88,20 @@ def sample_episodes(
     return Samples(np.array(frames), np.array(actions), np.array(next_frames), factors, np.array(episodes))
 
 
+def position_in_picture(factors: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Where the agent is, (n, 2) in cells or metres; in ScanNav, whose camera hangs above the goal, from the goal.
+
+    :param factors: of :class:`Samples`
+    """
+    agents = factors["agent"] - factors["goal"] if "scene" in factors else factors["agent"]
+    return np.asarray(agents, dtype=np.float64)
+
+
 def local_obstacles(factors: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """Whether the points around the agent are blocked, by an obstacle or because they lie outside.
 
-    Points are a cell (Nav2D) or a metre (the point mazes) apart, up to :data:`LOCAL_REACH` in each direction.
+    Points are a cell (Nav2D), a metre (the point mazes) or a step (the built-in flats of ScanNav) apart, up to
+    :data:`LOCAL_REACH` in each direction.
 
     :param factors: of :class:`Samples`
     :return: (n, (2 LOCAL_REACH + 1)^2 - 1), row by row
@@ -96,6 +109,8 @@ def local_obstacles(factors: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     steps = np.arange(-LOCAL_REACH, LOCAL_REACH + 1)
     offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     offsets = offsets[(offsets != 0).any(axis=1)]
+    if "scene" in factors:
+        return _blocked_in_flats(factors["agent"][:, None] + SCAN_STEP * offsets, factors["scene"])
     points = factors["agent"][:, None] + offsets
     obstacles = factors["obstacles"]
     if obstacles.dtype == bool:
@@ -106,6 +121,21 @@ def local_obstacles(factors: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     outside = (np.abs(points) > ROOM_SIZE / 2).any(axis=-1)
     within = (np.abs(points[:, :, None] - obstacles[:, None]) < _HALF_OBSTACLE).all(axis=-1)
     blocked = outside | within.any(axis=-1)
+    return blocked
+
+
+def _blocked_in_flats(points: NDArray[Any], scenes: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether an agent's centre cannot be at (x, y) in m, (n, m, 2), of the flats (n,)."""
+    blocked = np.ones(points.shape[:2], dtype=bool)
+    for k in np.unique(scenes).tolist():
+        scan = ScanMap.apartment(SEEDS[k])
+        here = scenes == k
+        column = np.floor((points[here, :, 0] - scan.origin[0]) / scan.metres_per_pixel).astype(np.int64)
+        row = np.floor((scan.origin[1] - points[here, :, 1]) / scan.metres_per_pixel).astype(np.int64)
+        height, width = scan.walkable.shape
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        walkable = scan.walkable[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        blocked[here] = ~(inside & walkable)
     return blocked
 
 
