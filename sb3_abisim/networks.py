@@ -12,7 +12,7 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
-from sb3_abisim.scan_networks import FEATURES_DIM, SmallScanNetwork, resnet18_layers
+from sb3_abisim.scan_networks import FEATURES_DIM, resnet18_layers, small_layers
 
 
 class Encoder(nn.Module):
@@ -143,7 +143,7 @@ class PointMazeEncoder(Encoder):
 
 
 class ScanNavEncoder(Encoder):
-    """128 x 128 RGB-D pictures to 2048 numbers, ours: a small network for CPUs, whose first 64 are coordinates.
+    """128 x 128 RGB-D pictures to 2048 numbers: a small network for CPUs, ours.
 
     :param n_input_channels: channels of the observation
     """
@@ -151,7 +151,7 @@ class ScanNavEncoder(Encoder):
     observation_shape = (4, 128, 128)
 
     def __init__(self, n_input_channels: int = 4) -> None:
-        super().__init__(SmallScanNetwork(n_input_channels), FEATURES_DIM, {"n_input_channels": n_input_channels})
+        super().__init__(small_layers(n_input_channels), FEATURES_DIM, {"n_input_channels": n_input_channels})
 
 
 class ScanNavResNet18(Encoder):

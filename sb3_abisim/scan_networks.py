@@ -10,7 +10,6 @@ import torch as th
 from torch import nn
 
 FEATURES_DIM = 2048
-N_POINTS = 32
 BASE_PLANES = 32
 N_GROUPS = 16
 
@@ -81,60 +80,18 @@ def resnet18_layers(n_input_channels: int, image_size: int) -> nn.Sequential:
     )
 
 
-class SpatialSoftmax(nn.Module):
-    """Where each channel of a map is large: the mean (x, y) over its softmax (Levine et al. 2016; Finn et al. 2016).
+def small_layers(n_input_channels: int) -> nn.Sequential:
+    """128 x 128 images to 2048 = 32 x 8 x 8 numbers, for computers without an accelerator.
 
-    :param side: height and width of the map
-    :param reach: coordinates run from minus this to this
-    """
-
-    def __init__(self, side: int, reach: float = 4.0) -> None:
-        super().__init__()
-        self.sharpness = nn.Parameter(th.ones(()))
-        line = th.linspace(-reach, reach, side)
-        self.places: th.Tensor
-        places = th.stack(th.meshgrid(line, line, indexing="xy"), dim=-1).reshape(-1, 2)
-        self.register_buffer("places", places, persistent=False)
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        """Coordinates of each channel.
-
-        :param x: (batch, channels, side, side)
-        :return: (batch, 2 channels)
-        """
-        weights = th.softmax(self.sharpness * x.flatten(2), dim=2)
-        return (weights @ self.places).flatten(1)
-
-
-class SmallScanNetwork(nn.Module):
-    """128 x 128 images to 2048 numbers, for computers without an accelerator.
-
-    32 channels of a 32 x 32 map become 64 coordinates: an agent is a few pixels large, and where they and those of its
-    nose are is hard to read from 8 x 8 cells. The other 31 x 8 x 8 numbers are those of a plain network. The first
-    stride is 4, since at 2 that layer alone would take most of the time.
+    The first stride is 4, since at 2 that layer alone would take most of the time.
 
     :param n_input_channels: channels of the images
     """
-
-    def __init__(self, n_input_channels: int) -> None:
-        super().__init__()
-        self.maps = nn.Sequential(
-            nn.Conv2d(n_input_channels, 16, 5, stride=4, padding=2), nn.ReLU(), nn.Conv2d(16, N_POINTS, 3, padding=1)
-        )
-        self.points = SpatialSoftmax(32)
-        self.cells = nn.Sequential(
-            nn.ReLU(),
-            nn.Conv2d(N_POINTS, 32, 3, stride=2, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(32, (FEATURES_DIM - 2 * N_POINTS) // 64, 3, stride=2, padding=1),
-            nn.Flatten(),
-        )
-
-    def forward(self, x: th.Tensor) -> th.Tensor:
-        """Coordinates, then cells.
-
-        :param x: (batch, n_input_channels, 128, 128)
-        :return: (batch, 2048)
-        """
-        maps = self.maps(x)
-        return th.cat([self.points(maps), self.cells(maps)], dim=1)
+    return nn.Sequential(
+        nn.Conv2d(n_input_channels, 16, 5, stride=4, padding=2),
+        nn.ReLU(),
+        nn.Conv2d(16, 32, 3, stride=2, padding=1),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, 3, stride=2, padding=1),
+        nn.Flatten(),
+    )

@@ -9,7 +9,6 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_abisim.networks import ENCODERS, make_encoder
-from sb3_abisim.scan_networks import SpatialSoftmax
 
 
 def image_space(*shape):
@@ -64,14 +63,6 @@ def test_habitats_resnet(size):
     assert encoder.layers[1](th.rand(1, 4, size // 2, size // 2)).shape == (1, 256, size // 64, size // 64)
     with pytest.raises(ValueError, match="image_size must be 64, 128 or 256, got 96"):
         make_encoder(image_space(4, 96, 96), "ScanNavResNet18", image_size=96)
-
-
-def test_spatial_softmax_finds_what_is_large():
-    """A single bright cell by its own coordinates, two as bright by their middle, a flat channel by the centre."""
-    maps = th.zeros(1, 3, 5, 5)
-    maps[0, 0, 1, 4] = maps[0, 1, 0, 0] = maps[0, 1, 2, 2] = 50.0
-    points = SpatialSoftmax(5, reach=2.0)(maps)
-    assert th.allclose(points, th.tensor([[2.0, -1.0, -1.0, -1.0, 0.0, 0.0]]), atol=1e-5)
 
 
 def test_inputs_are_mapped_to_plus_minus_one():
