@@ -114,14 +114,15 @@ def draw(result: dict[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, 2, figsize=(8, 3), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.6), sharex=True, layout="constrained")
     for axis, name in zip(axes, ("success", "spl"), strict=True):
         for run in result["runs"]:
             axis.plot(run["curve"]["steps"], run["curve"][name], label=f"PPO, {run['name']}")
         for (agent, scores), style in zip(result["agents"].items(), (":", "--", "-."), strict=True):
             axis.axhline(scores[name], color="grey", linestyle=style, label=agent)
         axis.set(xlabel="steps of all environments", ylabel={"spl": "SPL"}.get(name, name), ylim=(0, 1.02))
-    axes[1].legend(fontsize="small")
+    handles, labels = axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")
     figure.savefig(path, dpi=120)
 
 
