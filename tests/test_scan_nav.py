@@ -334,6 +334,15 @@ def test_scenes_of_every_kind(room, tmp_path):
     assert env.fingerprint != ScanNavVectorEnv(scenes=room).fingerprint
 
 
+def test_the_marker_is_part_of_the_fingerprint(room, monkeypatch):
+    """Datasets of states draw their frames later: another marker would show other pictures."""
+    kwargs = {"scenes": room, "goals_per_scene": 1}
+    arrow, box = (ScanNavVectorEnv(marker=marker, **kwargs).fingerprint for marker in ("arrow", "box"))
+    assert arrow != box == ScanNavVectorEnv(marker="box", **kwargs).fingerprint
+    monkeypatch.setitem(MARKERS, "arrow", MARKERS["box"])
+    assert ScanNavVectorEnv(**kwargs).fingerprint == box
+
+
 def test_the_papers_preset():
     env = gym.make("ScanNavPaper-v0", scenes=0, goals_per_scene=1, render_mode="rgb_array")
     frame, _ = env.reset(seed=0)
