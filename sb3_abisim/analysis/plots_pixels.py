@@ -82,8 +82,10 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
             clip = "" if not example["same_clip"] else ("same clip" if example["same_clip"][k] else "other clip")
             axis.set_title(f"d {example['distance'][k]:.2f}, {example['agent'][k]:.1f} m\n{clip}", fontsize=6)
         row[0].set_ylabel(name.rsplit("/", 1)[-1].removesuffix(".safetensors"), fontsize=7)
+    # One setting makes a narrow figure.
+    gap = "\n" if len(pictures) == 1 else " "
     figure.suptitle(
-        f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings, 1 is the mean of all "
+        f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings,{gap}1 is the mean of all "
         "neighbours; m: distance of the agents)",
         fontsize=8,
     )
