@@ -85,8 +85,8 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
     # One setting makes a narrow figure.
     gap = "\n" if len(pictures) == 1 else " "
     figure.suptitle(
-        f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings,{gap}1 is the mean of all "
-        "neighbours; m: distance of the agents)",
+        f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings,{gap}1 is the mean of "
+        "all neighbours; m: distance of the agents)",
         fontsize=8,
     )
     save(figure, path)
