@@ -37,6 +37,16 @@ def test_similarity_to_oneself_and_to_others():
     assert other["agent"] > 2 and abs(other["obstacles"]) < 0.3 and other["same_clip"] < 0.5
 
 
+def test_in_a_scan_agents_are_apart_in_the_picture():
+    """Flats lie anywhere in their own coordinates; what an encoder sees is where the agent is in the picture."""
+    samples = sample_episodes("ScanNav-v0", 6, 5, env_kwargs={"stop": "auto"})
+    partners = np.roll(np.arange(len(samples)), 5)
+    seen = samples.factors["agent"] - samples.factors["goal"]
+    expected = np.linalg.norm(seen - seen[partners], axis=1).mean()
+    found = similarity(samples, partners)
+    assert found["agent"] == pytest.approx(expected) and found["same_clip"] is None
+
+
 def test_encoder_of_one_channel_finds_its_like():
     masks = {"agent": np.zeros(SHAPE), "obstacles": np.zeros(SHAPE)}
     masks["agent"][0], masks["obstacles"][1] = 1, 1

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env
 
 from sb3_abisim.envs.scan_apartment import SEEDS, apartment_mesh
 from sb3_abisim.envs.scan_nav import ScanNavEnv, ScanNavVectorEnv, load_scene
-from sb3_abisim.envs.scan_view import MARKERS, area_means
+from sb3_abisim.envs.scan_view import MARKER_RADIUS, MARKERS, area_means
 from sb3_abisim.envs.scan_world import NODE, DistanceGrid, StartRule
 
 
@@ -332,6 +332,11 @@ def test_scenes_of_every_kind(room, tmp_path):
     env.reset(seed=0)
     assert set(env.factors()["scene"]) == {0, 1}
     assert env.fingerprint != ScanNavVectorEnv(scenes=room).fingerprint
+
+
+def test_no_marker_is_larger_than_the_border_allows():
+    corners = [corner for parts in MARKERS.values() for _, polygon in parts for corner in polygon]
+    assert max(np.hypot(*corner) for corner in corners) <= MARKER_RADIUS
 
 
 def test_the_marker_is_part_of_the_fingerprint(room, monkeypatch):
