@@ -3,6 +3,7 @@
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 
+from sb3_abisim.allocator import keep_freed_memory
 from sb3_abisim.extractors import find_extractors, require_weights
 from sb3_abisim.vec_env import VecEncodeObservations
 
@@ -10,7 +11,8 @@ from sb3_abisim.vec_env import VecEncodeObservations
 class EncoderCallback(BaseCallback):
     """States the encoders when training starts, refuses to train without their weights, and logs their drift.
 
-    Also states the fingerprint of the clips or scans that the training environment shows, if it has one. Logs
+    Also states the fingerprint of the clips or scans that the training environment shows, if it has one, and lets torch
+    reuse memory (:mod:`sb3_abisim.allocator`). Logs
     ``encoder/drift`` at the end of each rollout: how far the weights have moved from those that training started with,
     relative to the norm of the latter (the largest value, where actor and critic have encoders of their own).
 
@@ -19,6 +21,7 @@ class EncoderCallback(BaseCallback):
     """
 
     def _on_training_start(self) -> None:
+        keep_freed_memory()
         require_weights(self.model)
         self._extractors = [extractor for _, extractor in find_extractors(self.model.policy)]
         for name, extractor in find_extractors(self.model.policy):

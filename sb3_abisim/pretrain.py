@@ -53,12 +53,14 @@ def pretrain(
     :raises ValueError: if the output belongs to other settings, or anything does not fit together
     :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
     """
+    from sb3_abisim.allocator import keep_freed_memory
     from sb3_abisim.atomic import folder_lock
     from sb3_abisim.dataset import TransitionDataset
     from sb3_abisim.pretrain_run import PretrainRun
 
     if objective not in OBJECTIVE_NAMES:
         raise ValueError(f"unknown objective {objective!r}; known are {', '.join(OBJECTIVE_NAMES)}")
+    keep_freed_memory()
     output = Path(output)
     if output.suffix != ".safetensors":
         raise ValueError(f"the output must end in .safetensors, got {output}")

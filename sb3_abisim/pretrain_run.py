@@ -2,8 +2,10 @@
 
 import itertools
 import json
+import math
 import platform
 import shlex
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -134,6 +136,23 @@ class PretrainRun:
         )
         for checkpoint in self._checkpoints():
             checkpoint.unlink()
+        self._warn_at_chance()
+
+    def _warn_at_chance(self) -> None:
+        """An encoder that has learned nothing looks like any other file."""
+        name = "test/accuracy" if self.config.holdout else "train/accuracy"
+        accuracy = self.rows[-1].get(name) if self.rows else None
+        chance = self.module.chance_accuracy(self.config.batch_size)
+        if accuracy is None or chance is None:
+            return
+        n = self.config.batch_size * N_HOLDOUT_BATCHES
+        if accuracy <= chance + max(0.005, 3 * math.sqrt(chance * (1 - chance) / n)):
+            warnings.warn(
+                f"{self.output}: {name} ended at {accuracy:.3g}, no better than guessing ({chance:.3g}), so the "
+                "encoder has learned nothing of its objective; try more updates, another seed, a smaller l1_penalty "
+                "or, for ssi and acro, a change_weight above 1",
+                stacklevel=2,
+            )
 
     def _sample_observations(self) -> th.Tensor:
         """Observations from all over the dataset, as floats on the CPU."""

@@ -128,3 +128,7 @@ def test_refuses_bad_settings(kwargs):
 def test_takes_every_augmentation(augmentation):
     objective = CURL(LineEncoder(), DISCRETE, augmentation=augmentation, strength=0.3)
     assert math.isfinite(float(objective.loss(make_batch(DISCRETE, 8))[0].detach()))
+
+
+def test_accuracy_of_guessing():
+    assert CURL(LineEncoder(), DISCRETE).chance_accuracy(256) == 1 / 256

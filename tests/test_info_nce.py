@@ -98,3 +98,10 @@ def test_refuses_bad_settings():
     InfoNCE.check_k(1), InfoNCE.check_k(4)
     with pytest.raises(ValueError, match=re.escape("[1, 4]")):
         InfoNCE.check_k([1, 4])
+
+
+@pytest.mark.parametrize(
+    ("space", "k", "n_candidates"), [(DISCRETE, 1, 3), (DISCRETE, 2, 9), (DISCRETE, 6, 256), (CONTINUOUS, 1, 256)]
+)
+def test_accuracy_of_guessing(space, k, n_candidates):
+    assert InfoNCE(LineEncoder(), space, k=k).chance_accuracy(256) == 1 / n_candidates

@@ -184,3 +184,8 @@ def test_acro_is_the_same_loss_for_several_steps():
     for k in (1, [1, 1]):
         with pytest.raises(ValueError, match="which is ssi"):
             ACRO.check_k(k)
+
+
+@pytest.mark.parametrize(("space", "chance"), [(DISCRETE, 1 / 3), (CONTINUOUS, 0.0)])
+def test_accuracy_of_guessing(space, chance):
+    assert InverseDynamics(LineEncoder(), space).chance_accuracy(256) == chance

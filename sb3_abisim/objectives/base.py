@@ -121,5 +121,12 @@ class Objective(nn.Module):
         """
         raise NotImplementedError
 
+    def chance_accuracy(self, batch_size: int) -> float | None:
+        """What the term ``accuracy`` is without having learned anything; None for a loss that has no such term.
+
+        :param batch_size: of the batches
+        """
+        return None
+
     def after_step(self) -> None:
         """Called after each optimiser step, for target networks and schedules."""

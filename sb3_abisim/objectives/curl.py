@@ -71,6 +71,13 @@ class CURL(Objective):
         # them dot products.
         self.weight = nn.Parameter(th.eye(encoder.features_dim))
 
+    def chance_accuracy(self, batch_size: int) -> float:
+        """One in the number of keys.
+
+        :param batch_size: of the batches
+        """
+        return 1.0 / batch_size
+
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """InfoNCE between two changed copies; terms ``contrast`` and ``accuracy`` (share of keys found).
 

@@ -79,6 +79,13 @@ class InfoNCE(Objective):
         if not isinstance(k, int):
             raise ValueError(f"info_nce takes sequences of one length, got k = {k}; give one number")
 
+    def chance_accuracy(self, batch_size: int) -> float:
+        """One in the number of candidates: all action sequences, or those of the batch, if they are fewer.
+
+        :param batch_size: of the batches
+        """
+        return 1.0 / (batch_size if self.n_actions is None else min(batch_size, self.n_actions**self.k))
+
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """InfoNCE; terms ``contrast``, ``l1_norm`` and ``accuracy`` (share of actions found among the candidates).
 

@@ -113,13 +113,18 @@ class InverseDynamics(Objective):
         log_prob, accuracy = self._score(self.inverse_model(inputs), batch.actions)
         beta = th.as_tensor(self.l1_penalty)
         if self.adaptive is not None:
-            # Continuous accuracy is a coefficient of determination, 0 for a guess.
-            chance = 0.0 if self.n_actions is None else 1.0 / self.n_actions
-            beta = adaptive_beta(self.l1_penalty, self.accuracy, self.adaptive, chance)
+            beta = adaptive_beta(self.l1_penalty, self.accuracy, self.adaptive, self.chance_accuracy(len(psi)))
         loss, terms = inverse_dynamics_loss(log_prob, psi, psi_next, beta)
         if self.training:
             self.accuracy.copy_(accuracy)
         return loss, {**{k: v.detach() for k, v in terms.items()}, "beta": beta, "accuracy": accuracy}
+
+    def chance_accuracy(self, batch_size: int) -> float:
+        """One in the number of actions; 0 for continuous ones, whose accuracy is a coefficient of determination.
+
+        :param batch_size: makes no difference
+        """
+        return 0.0 if self.n_actions is None else 1.0 / self.n_actions
 
     def _score(self, outputs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Log-likelihood of each action (batch,), and the share of correct predictions (or clipped R^2)."""
