@@ -62,6 +62,12 @@ def test_sweep_refuses_a_wrong_name(tmp_path):
         sweep_encoders([0.75], "Nav2D-v0/ssi", tmp_path, None, "Nav2D-v0")
 
 
+def test_sweep_refuses_encoders_of_another_base(tmp_path):
+    shutil.copy(resource_path("encoders") / "Nav2D-v0/abisim.safetensors", tmp_path / "abisim_c0.9.safetensors")
+    with pytest.raises(ValueError, match="on another base encoder than Nav2D-v0/acro"):
+        sweep_encoders([0.9], "Nav2D-v0/acro", tmp_path, None, "Nav2D-v0")
+
+
 @pytest.mark.slow
 def test_sweep_pretrains_what_is_missing_once(tmp_path):
     collect("Nav2D-v0", 600, tmp_path / "data", n_envs=6)

@@ -21,8 +21,9 @@ def sweep_encoders(
     :param data: dataset to pretrain on, needed for what is missing
     :param env_id: environment of the dataset
     :param n_updates: of each pretraining
-    :raises ValueError: for missing encoders without data, or data of another environment
+    :raises ValueError: for missing encoders without data, data of another environment, or encoders of another base
     """
+    base_digest = load_encoder(base).digest
     files = {}
     for c in values:
         path = folder / f"abisim_c{c:g}.safetensors"
@@ -38,4 +39,9 @@ def sweep_encoders(
         found_c = files[c].contract["settings"]["objective_kwargs"].get("c")
         if found_c != c:
             raise ValueError(f"{path} was trained with c = {found_c}, its name says {c:g}; rename or remove it")
+        if (found_base := files[c].contract["settings"]["base_digest"]) != base_digest:
+            raise ValueError(
+                f"{path} was trained on another base encoder than {base} (digests {found_base[:8]}, {base_digest[:8]}); "
+                "give that one as --base, or remove the file"
+            )
     return files
