@@ -159,6 +159,7 @@ def main(argv: list[str] | None = None) -> None:
     use_one_core()
     from sb3_abisim.collect import collect
 
+    peak = matmul_rate()
     rows, notes = [], []
     for env_id in ENV_IDS:
         with tempfile.TemporaryDirectory() as folder:
@@ -176,17 +177,19 @@ def main(argv: list[str] | None = None) -> None:
                     parts = ", ".join(f"{name} {share:.0%}" for name, share in shares(run, 2 * args.updates).items())
                     label = f"`{objective}`, {env_id}" + (f", `run_length: {length}`" if length > 1 else "")
                     ratio = fast / plain
-                    rows.append(f"| {label} | {plain:,.0f} | {fast:,.0f} | {ratio:.1f} | {AIM:.0f} | {flops:.0f} |")
+                    numbers = f"{plain:,.0f} | {fast:,.0f} | {ratio:.1f} | {AIM:.0f} | {flops:.0f}"
+                    rows.append(f"| {label} | {numbers} | {ratio * peak / flops:.1f} |")
                     notes.append(f"* {label}: {parts}")
                     print(rows[-1], notes[-1], flush=True)
     text = (
         f"`python -m benchmarks.bench_pretrain` on {machine()}, batches of {BATCH_SIZE}: transitions per second of "
         f"processor time in the fastest of {args.rounds} turns of {args.updates} updates. A product of two 1024 x 1024 "
-        f"matrices reaches {matmul_rate():.0f} GFLOP/s on this core."
+        f"matrices reaches {peak:.0f} GFLOP/s on this core; the bound is the ratio that ours would have at that rate, with "
+        "no time for anything but convolutions and products."
     )
     header = [
-        "| objective, environment | straightforward | ours | ratio | aim | ours, GFLOP/s |",
-        "|---|---:|---:|---:|---:|---:|",
+        "| objective, environment | straightforward | ours | ratio | aim | ours, GFLOP/s | bound |",
+        "|---|---:|---:|---:|---:|---:|---:|",
     ]
     write_page(args.output, "Speed of pretraining", text, header, rows, ("Where our time goes:", "", *notes, ""))
 
