@@ -184,8 +184,8 @@ def main(argv: list[str] | None = None) -> None:
     text = (
         f"`python -m benchmarks.bench_pretrain` on {machine()}, batches of {BATCH_SIZE}: transitions per second of "
         f"processor time in the fastest of {args.rounds} turns of {args.updates} updates. A product of two 1024 x 1024 "
-        f"matrices reaches {peak:.0f} GFLOP/s on this core; the bound is the ratio that ours would have at that rate, with "
-        "no time for anything but convolutions and products."
+        f"matrices reaches {peak:.0f} GFLOP/s on this core; the bound is the ratio that ours would have at that "
+        "rate, with no time for anything but convolutions and products."
     )
     header = [
         "| objective, environment | straightforward | ours | ratio | aim | ours, GFLOP/s | bound |",
