@@ -145,12 +145,12 @@ def draw_near_and_far(results: dict[str, Any], path: Path) -> None:
     encoders = results["encoders"]
     n = len(encoders)
     figure, axes = plt.subplots(1, n + 1, figsize=(3.0 * n + 3.4, 3.4), constrained_layout=True)
-    top = 1.05 * max(max(result["near"] + result["far"]) for result in encoders.values())
     for axis, (name, result) in zip(axes, encoders.items(), strict=False):
         axis.violinplot([result["near"], result["far"]], showmedians=True)
         axis.set_xticks([1, 2], ["near", "far"])
         axis.set_title(f"{short_name(name)}\nnear > far in {result['near_share']:.0%}", fontsize=9)
-        axis.set_ylim(0, top)
+        # A scale for each: what pictures' reconstruction makes of an obstacle is ten times what dynamics make of it.
+        axis.set_ylim(bottom=0)
         axis.grid(axis="y", alpha=0.3)
     axes[0].set_ylabel("change of the embedding\n(1: the agent elsewhere)")
     _show_regions(axes[n], results)
