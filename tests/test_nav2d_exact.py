@@ -135,8 +135,9 @@ def test_layouts_have_seeds_of_their_own():
 
 def test_base_encoder_agrees_with_the_metric_at_c_0(base, few_cells):
     comparison = ExactReference(base, c=0.0, n_layouts=1).compare(base)
-    assert comparison.map_correlation == pytest.approx(1.0, abs=1e-3)
-    assert comparison.state_correlation == pytest.approx(1.0, abs=1e-3)
+    # Not to the last digit: rounding swaps the ranks of cells that count nearly the same.
+    assert comparison.map_correlation == pytest.approx(1.0, abs=3e-3)
+    assert comparison.state_correlation == pytest.approx(1.0, abs=3e-3)
     assert comparison.profile_error == pytest.approx(0.0, abs=1e-4)
 
 
