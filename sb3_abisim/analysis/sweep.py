@@ -41,7 +41,7 @@ def sweep_encoders(
             raise ValueError(f"{path} was trained with c = {found_c}, its name says {c:g}; rename or remove it")
         if (found_base := files[c].contract["settings"]["base_digest"]) != base_digest:
             raise ValueError(
-                f"{path} was trained on another base encoder than {base} (digests {found_base[:8]}, {base_digest[:8]}); "
-                "give that one as --base, or remove the file"
+                f"{path} was trained on another base encoder than {base} (digests {found_base[:8]}, "
+                f"{base_digest[:8]}); give that one as --base, or remove the file"
             )
     return files
