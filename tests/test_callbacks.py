@@ -129,3 +129,12 @@ def test_backgrounds_are_stated(capsys: pytest.CaptureFixture[str]) -> None:
     env.fingerprint = "0123abcd"  # type: ignore[attr-defined]
     learn(PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1), 16)
     assert "Pictures of the training environment: 0123abcd\n" in capsys.readouterr().out
+
+
+def test_training_keeps_freed_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[bool] = []
+    monkeypatch.setattr("sb3_abisim.callbacks.keep_freed_memory", lambda: calls.append(True))
+    policy_kwargs = {"features_extractor_class": VanillaExtractor}
+    model = PPO("CnnPolicy", Grid(), n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=policy_kwargs, device="cpu")
+    model.learn(8, callback=EncoderCallback())
+    assert calls == [True]

@@ -14,11 +14,9 @@ import torch as th
 
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.collect import main as collect
-from sb3_abisim.dataset import TransitionDataset
 from sb3_abisim.objectives import InverseDynamics
 from sb3_abisim.pretrain import main, pretrain
 from sb3_abisim.pretrain_config import PretrainConfig, load_config
-from sb3_abisim.pretrain_run import PretrainRun
 
 SETTINGS = {"n_updates": 30, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5}
 
@@ -47,26 +45,6 @@ def test_writes_encoder_card_and_log(data, tmp_path):
     assert len(log.read_text().splitlines()) == 7
     assert not list(output.with_suffix(".run").glob("checkpoint*")), "checkpoints go when the run is over"
     assert list(output.with_suffix(".run").glob("events.out.tfevents*"))
-
-
-def test_warns_when_nothing_was_learned(data, tmp_path):
-    with pytest.warns(UserWarning, match=r"ssi.safetensors: test/accuracy .* no better than guessing \(0.25\)"):
-        output = run(data, tmp_path / "ssi.safetensors", learning_rate=1e-9)
-    assert load_encoder(str(output)).contract["objective"] == "ssi"
-    with pytest.warns(UserWarning, match="train/accuracy"):
-        run(data, tmp_path / "all.safetensors", learning_rate=1e-9, holdout=0.0)
-
-
-@pytest.mark.parametrize(("accuracy", "warns"), [(0.24, True), (0.33, True), (0.34, False), (0.95, False)])
-def test_what_counts_as_guessing(data, tmp_path, accuracy, warns):
-    # 256 held-out actions: the standard error of a quarter is 0.027.
-    config = load_config("ssi", "Nav2D-v0", SETTINGS)
-    pretraining = PretrainRun("ssi", TransitionDataset(data), tmp_path / "x.safetensors", config, None, 0, "cpu")
-    pretraining.rows = [{"n_updates": 30, "test/accuracy": accuracy}]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        pretraining._warn_at_chance()
-    assert bool(caught) == warns
 
 
 def test_a_callback_adds_to_the_log_and_changes_nothing_else(data, tmp_path):

@@ -1,0 +1,54 @@
+"""An encoder that has learned nothing is not handed over without a word; memory is kept from the start."""
+
+import warnings
+
+import pytest
+
+from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.collect import collect
+from sb3_abisim.dataset import TransitionDataset
+from sb3_abisim.pretrain import pretrain
+from sb3_abisim.pretrain_config import load_config
+from sb3_abisim.pretrain_run import PretrainRun
+
+# Learns nothing.
+SETTINGS = {"n_updates": 10, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5, "learning_rate": 1e-9}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "nav2d"
+    collect("Nav2D-v0", 2000, folder, n_envs=8)
+    return folder
+
+
+def run(data, output, **settings):
+    config = load_config("ssi", "Nav2D-v0", {**SETTINGS, **settings})
+    return pretrain("ssi", data, output, config, device="cpu", progress_bar=False, verbose=0)
+
+
+@pytest.mark.parametrize(("holdout", "name"), [(0.05, "test/accuracy"), (0.0, "train/accuracy")])
+def test_warns_when_nothing_was_learned(data, tmp_path, holdout, name):
+    with pytest.warns(UserWarning, match=rf"ssi.safetensors: {name} .* no better than guessing \(0.25\)"):
+        output = run(data, tmp_path / "ssi.safetensors", holdout=holdout)
+    assert load_encoder(str(output)).contract["objective"] == "ssi"
+
+
+@pytest.mark.parametrize(("accuracy", "warns"), [(0.24, True), (0.33, True), (0.34, False), (0.95, False)])
+def test_what_counts_as_guessing(data, tmp_path, accuracy, warns):
+    # 256 held-out actions: the standard error of a quarter is 0.027.
+    config = load_config("ssi", "Nav2D-v0", SETTINGS)
+    pretraining = PretrainRun("ssi", TransitionDataset(data), tmp_path / "x.safetensors", config, None, 0, "cpu")
+    pretraining.rows = [{"n_updates": 10, "test/accuracy": accuracy}]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        pretraining._warn_at_chance()
+    assert bool(caught) == warns
+
+
+def test_pretraining_keeps_freed_memory(data, tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr("sb3_abisim.allocator.keep_freed_memory", lambda: calls.append(True))
+    with pytest.warns(UserWarning, match="guessing"):
+        run(data, tmp_path / "ssi.safetensors")
+    assert calls
