@@ -13,7 +13,7 @@ N_UPDATES = 2000
 def sweep_encoders(
     values: list[float], base: str, folder: Path, data: Path | None, env_id: str, n_updates: int = N_UPDATES
 ) -> dict[float, EncoderFile]:
-    """The encoders of a sweep; those that ``folder`` does not hold are pretrained first, four minutes each on one core.
+    """The encoders of a sweep; those that ``folder`` does not hold are pretrained first, two minutes each on one core.
 
     :param values: of c, each in [0, 1)
     :param base: file or name of the base encoder
