@@ -15,9 +15,12 @@ from sb3_abisim.allocator import keep_freed_memory
 if {keep}:
     assert keep_freed_memory()
 def fill():
-    th.ones(20_000_000)  # 80 MB, more than glibc keeps by itself
+    # 80 MB each, more than glibc keeps by itself; freed together, the end of the heap among them.
+    a = th.ones(20_000_000)
+    b = a + 1
+    c = b * 2
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(30):
+for _ in range(15):
     fill()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
