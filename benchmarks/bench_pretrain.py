@@ -2,13 +2,13 @@
 
 The straightforward loop is a ``torch.utils.data.Dataset`` that indexes one transition after the other and makes it
 float32, a ``DataLoader`` that shuffles and stacks them, pictures channels first, and Adam. Ours is measured with single
-transitions and, where both ends are embedded by the trained encoder, with ``run_length: 8``. All loops run in turns
-within one process, on one core, and the speed of each is that of its fastest turn, by processor time, which load on the
-machine disturbs less than the clock. ``make bench``.
+transitions and, where both ends are embedded by the trained encoder, with ``run_length: 8``. The loops run in turns on
+one core, each in a process of its own, because ours sets the allocator (``sb3_abisim.allocator``). The speed of each is
+that of its fastest turn, by processor time, which load on the machine disturbs less than the clock. ``make bench``.
 """
 
 import argparse
-import functools
+import multiprocessing
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -82,17 +82,46 @@ def make_run(objective: str, data: Path, base: str | None, folder: Path, run_len
     return PretrainRun(objective, dataset, folder / "x.safetensors", config, base, seed=0, device="cpu")
 
 
-def fastest_turns(loops: dict[int, Iterator[float]], rounds: int, n_updates: int) -> dict[int, float]:
-    """Transitions per second of the fastest turn of each loop."""
-    best = dict.fromkeys(loops, 0.0)
-    for loop in loops.values():
+def serve_turns(pipe: Any, objective: str, data: Path, base: str | None, run_length: int) -> None:
+    """In a process of its own: for every number of updates received, send the transitions per second; stop at 0.
+
+    :param pipe: the process's end of a pipe
+    :param run_length: of our loop; 0 for the straightforward one
+    """
+    use_one_core()
+    if run_length:
+        from sb3_abisim.allocator import keep_freed_memory
+
+        # As sb3_abisim.pretrain does.
+        keep_freed_memory()
+    with tempfile.TemporaryDirectory() as folder:
+        run = make_run(objective, data, base, Path(folder), max(run_length, 1))
+        loop = ours(run) if run_length else straightforward(run)
         next(loop)
-    for _ in range(rounds):
-        for name, loop in loops.items():
+        while n_updates := pipe.recv():
             start = time.process_time()
             for _ in range(n_updates):
                 next(loop)
-            best[name] = max(best[name], n_updates * BATCH_SIZE / (time.process_time() - start))
+            pipe.send(n_updates * BATCH_SIZE / (time.process_time() - start))
+
+
+def fastest_turns(
+    objective: str, data: Path, base: str | None, run_lengths: list[int], rounds: int, n_updates: int
+) -> dict[int, float]:
+    """Transitions per second of the fastest turn of each loop, by its ``run_length`` (:func:`serve_turns`)."""
+    context = multiprocessing.get_context("spawn")
+    pipes = {}
+    for length in run_lengths:
+        pipes[length], theirs = context.Pipe()
+        context.Process(target=serve_turns, args=(theirs, objective, data, base, length), daemon=True).start()
+        theirs.close()
+    best = dict.fromkeys(run_lengths, 0.0)
+    for _ in range(rounds):
+        for length, pipe in pipes.items():
+            pipe.send(n_updates)
+            best[length] = max(best[length], pipe.recv())
+    for pipe in pipes.values():
+        pipe.send(0)
     return best
 
 
@@ -157,8 +186,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--updates", type=int, default=6, help="updates per turn (default: %(default)s)")
     args = parser.parse_args(argv)
     use_one_core()
+    from sb3_abisim.allocator import keep_freed_memory
     from sb3_abisim.collect import collect
 
+    keep_freed_memory()  # for the shares of our time
     peak = matmul_rate()
     rows, notes = [], []
     for env_id in ENV_IDS:
@@ -167,12 +198,10 @@ def main(argv: list[str] | None = None) -> None:
             collect(env_id, N_TRANSITIONS, data)
             for objective, run_lengths in OBJECTIVES:
                 base = f"{env_id}/ssi" if objective == "abisim" else None
-                make = functools.partial(make_run, objective, data, base, Path(folder))
-                loops = {0: straightforward(make())} | {length: ours(make(length)) for length in run_lengths}
-                speed = fastest_turns(loops, args.rounds, args.updates)
+                speed = fastest_turns(objective, data, base, [0, *run_lengths], args.rounds, args.updates)
                 plain = speed.pop(0)
                 for length, fast in speed.items():
-                    run = make(length)
+                    run = make_run(objective, data, base, Path(folder), length)
                     flops = flops_per_update(run) * fast / BATCH_SIZE / 1e9
                     parts = ", ".join(f"{name} {share:.0%}" for name, share in shares(run, 2 * args.updates).items())
                     label = f"`{objective}`, {env_id}" + (f", `run_length: {length}`" if length > 1 else "")

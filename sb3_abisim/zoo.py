@@ -188,6 +188,11 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
     def read_hyperparameters(self: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         env_id = self.env_name.gym_id
         if env_id not in ENV_IDS:
+            if re.split("[=,]", str(self.config))[0] in EXTRACTORS:
+                raise ValueError(
+                    f"--conf-file {self.config} needs hyperparameters of ours, which {env_id} has not; "
+                    "write a YAML file for it, as docs/zoo.md shows"
+                )
             return original(self)  # type: ignore[no-any-return]
         if self.trial_id is not None:
             raise ValueError(
@@ -209,12 +214,10 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
             self.vec_env_class = _in_lockstep(self.vec_env_class)
         # Hyperparameters are selected on the training clips, so that evaluation clips stay unseen.
         if env_id in DISTRACTOR_IDS and not self.optimize_hyperparameters:
-            given = self._eval_env_kwargs_args
-            if given is None:
-                # "split" and "clips" say what training sees; all else holds for evaluation too.
-                shared = hyperparams.get("env_kwargs", self.env_kwargs)
-                given = {name: value for name, value in shared.items() if name not in ("split", "clips")}
-            self.eval_env_kwargs = {"split": "eval", **given}
+            # "split" and "clips" say what training sees; all else holds for evaluation too.
+            shared = hyperparams.get("env_kwargs", self.env_kwargs)
+            shared = {name: value for name, value in shared.items() if name not in ("split", "clips")}
+            self.eval_env_kwargs = {"split": "eval", **shared, **(self._eval_env_kwargs_args or {})}
         return hyperparams, saved_hyperparams
 
     return read_hyperparameters

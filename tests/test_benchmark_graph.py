@@ -132,6 +132,13 @@ def test_given_encoders_of_several_seeds(tmp_path: Path) -> None:
         build(dataclasses.replace(plan, methods=(f"ssi={tmp_path}/ssi{{seed}}",), encoder_seeds=(5,)))
 
 
+def test_random_agents_of_scan_nav_do_not_stop_at_once() -> None:
+    cells = {cell.kind: cell for cell in build(Plan(methods=("ssi",), env_ids=("ScanNav-v0",), seeds=(0,)))}
+    assert cells["data"].command[-2:] == ("--env-kwargs", "stop:'auto'")
+    assert cells["data"].settings["env_kwargs"] == {"stop": "auto"} and cells["data"].units == 100_000
+    assert cells["run"].inputs[0].inputs == (cells["data"],)
+
+
 def test_distractors_are_evaluated_on_three_splits() -> None:
     for cell in build(PLAN):
         if cell.kind == "final":

@@ -227,6 +227,8 @@ def test_mistakes_are_refused(manager: Any) -> None:
         manager("ppo", "Nav2D-v0", "ssi,frozen", hyperparams={"vec_env_wrapper": []}).read_hyperparameters()
     with pytest.raises(ValueError, match="--trial-id would replace policy_kwargs"):
         manager("ppo", "Nav2D-v0", trial_id=3).read_hyperparameters()
+    with pytest.raises(ValueError, match=r"abisim=mine\.safetensors needs hyperparameters of ours, which CartPole-v1"):
+        manager("ppo", "CartPole-v1", "abisim=mine.safetensors").read_hyperparameters()
 
 
 def test_installing_again_changes_nothing() -> None:
@@ -253,6 +255,8 @@ def test_evaluation_is_on_unseen_clips(manager: Any, config: str | None) -> None
     assert kwargs(env_kwargs=only) == (only, {"reward": "binary", "split": "eval"})
     assert kwargs(eval_env_kwargs={"split": "clean"}) == ({}, {"split": "clean"})
     assert kwargs(eval_env_kwargs={"order": "shuffled"}) == ({}, {"order": "shuffled", "split": "eval"})
+    both = kwargs(env_kwargs={"videos": "mine", "order": "shuffled"}, eval_env_kwargs={"order": "loop"})
+    assert both[1] == {"split": "eval", "videos": "mine", "order": "loop"}
     in_yaml = {"env_kwargs": {"order": "shuffled"}}
     assert kwargs(hyperparams=in_yaml) == ({"order": "shuffled"}, {"order": "shuffled", "split": "eval"})
     # Choosing hyperparameters must not look at the evaluation clips.

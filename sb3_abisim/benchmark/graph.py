@@ -24,7 +24,9 @@ from sb3_abisim.pretrain_config import load_config
 from sb3_abisim.zoo import DISTRACTOR_IDS, UNTRAINED, Method, hyperparameters_file
 
 # The paper's Table of data: random-action transitions for pretraining.
-PAPER_N_TRANSITIONS = {"Nav2D": 1_000_000, "PointMaze": 250_000}
+PAPER_N_TRANSITIONS = {"Nav2D": 1_000_000, "PointMaze": 250_000, "ScanNav": 100_000}
+# A random agent that may stop does so after four steps.
+DATA_ENV_KWARGS = {"ScanNav": {"stop": "auto"}}
 # "Steps per eval", given for Pointmass alone.
 PAPER_EVAL_FREQ = 16_384
 
@@ -157,10 +159,14 @@ def build(plan: Plan) -> list[Cell]:
 def data_cell(plan: Plan, env_id: str) -> Cell:
     """The dataset of an environment."""
     n = plan.n_transitions or next(n for name, n in PAPER_N_TRANSITIONS.items() if name in env_id)
-    settings = {"env_id": env_id, "n_transitions": n, "seed": 0}
+    env_kwargs = next((kwargs for name, kwargs in DATA_ENV_KWARGS.items() if name in env_id), {})
+    settings: dict[str, Any] = {"env_id": env_id, "n_transitions": n, "seed": 0}
+    # Only where there are any, so that the names of the other environments' cells stay.
+    settings |= {"env_kwargs": env_kwargs} if env_kwargs else {}
     output = f"data/{env_id}-{_key('data', settings)[:8]}"
-    command = ("sb3_abisim.collect", "--env", env_id, "-n", str(n), "-o", output)
-    return Cell("data", f"collect {env_id}", settings, (), command, output, "meta.json", n)
+    command = ["sb3_abisim.collect", "--env", env_id, "-n", str(n), "-o", output]
+    command += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in env_kwargs.items())] if env_kwargs else []
+    return Cell("data", f"collect {env_id}", settings, (), tuple(command), output, "meta.json", n)
 
 
 def encoder_cell(plan: Plan, env_id: str, objective: str, seed: int) -> Cell:
