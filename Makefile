@@ -52,7 +52,7 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_scan
 	$(BIN)/python -m benchmarks.bench_allocator
 
-figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about half an hour
+figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about a quarter of an hour
 	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results
 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes

@@ -6,7 +6,7 @@ from typing import Any
 from sb3_abisim.checkpoint import EncoderFile
 
 # What to show of an objective, the first of these that its card has, else the training loss.
-TERMS = ("test/accuracy", "test/metric", "test/loss", "train/loss")
+TERMS = ("test/accuracy", "test/metric", "test/reconstruction", "train/loss")
 
 
 def curves(files: dict[str, EncoderFile]) -> dict[str, Any]:
