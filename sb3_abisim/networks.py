@@ -100,20 +100,24 @@ class Nav2DEncoder(Encoder):
     stride 2 (15 -> 7 -> 5 -> 3), no nonlinearity after the last.
 
     :param n_input_channels: channels of the observation
+    :param features_dim: size of the embedding, 9 for each channel of the last convolution
+    :raises ValueError: if ``features_dim`` is not a multiple of 9
     """
 
     observation_shape = (3, 15, 15)
 
-    def __init__(self, n_input_channels: int = 3) -> None:
+    def __init__(self, n_input_channels: int = 3, features_dim: int = 576) -> None:
+        if features_dim < 1 or features_dim % 9:
+            raise ValueError(f"features_dim must be a multiple of 9, got {features_dim!r}")
         layers = nn.Sequential(
             nn.Conv2d(n_input_channels, 32, 3, stride=2),
             nn.ReLU(inplace=True),
             nn.Conv2d(32, 64, 3),
             nn.ReLU(inplace=True),
-            nn.Conv2d(64, 64, 3),
+            nn.Conv2d(64, features_dim // 9, 3),
             nn.Flatten(),
         )
-        super().__init__(layers, 576, {"n_input_channels": n_input_channels})
+        super().__init__(layers, features_dim, {"n_input_channels": n_input_channels, "features_dim": features_dim})
 
 
 class PointMazeEncoder(Encoder):

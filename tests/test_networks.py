@@ -24,6 +24,19 @@ def test_paper_sizes(shape, features_dim):
     assert encoder(th.rand(2, *shape)).shape == (2, features_dim) and encoder.features_dim == features_dim
 
 
+@pytest.mark.parametrize(("shape", "features_dim"), [((3, 15, 15), 144), ((3, 64, 64), 50)])
+def test_other_sizes_of_the_embedding(shape, features_dim):
+    encoder = make_encoder(image_space(*shape), features_dim=features_dim)
+    assert encoder(th.rand(2, *shape)).shape == (2, features_dim) and encoder.features_dim == features_dim
+    assert encoder.spec()["kwargs"]["features_dim"] == features_dim
+
+
+@pytest.mark.parametrize("features_dim", [0, -9, 100])
+def test_sizes_that_nav2d_cannot_have(features_dim):
+    with pytest.raises(ValueError, match=f"features_dim must be a multiple of 9, got {features_dim}"):
+        make_encoder(image_space(3, 15, 15), features_dim=features_dim)
+
+
 @pytest.mark.parametrize("name", ENCODERS)
 def test_spec_rebuilds_the_network(name):
     shape = ENCODERS[name].observation_shape
