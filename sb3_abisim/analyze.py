@@ -167,6 +167,8 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def _exact_command(args: argparse.Namespace) -> None:
+    if args.output is not None:
+        Path(args.output).parent.mkdir(parents=True, exist_ok=True)
     results = exact(args.encoders, args.base, args.c, args.env, args.n_layouts, args.seed)
     print(table(results))
     if args.output is not None:

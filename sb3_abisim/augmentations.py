@@ -23,10 +23,12 @@ def random_shift(images: th.Tensor, strength: float) -> th.Tensor:
     """Shift by whole pixels, repeating the border (Yarats et al. 2021).
 
     :param images: the pictures
-    :param strength: largest shift along each axis, as a share of the side
+    :param strength: largest shift along each axis, as a share of the side; above 0, it is a pixel at least
     """
     n, _, height, width = images.shape
-    dy, dx = (_integers(n, round(strength * side)).to(images.device) for side in (height, width))
+    dy, dx = (
+        _integers(n, max(round(strength * side), int(strength > 0))).to(images.device) for side in (height, width)
+    )
     rows = (th.arange(height, device=images.device) + dy[:, None]).clamp(0, height - 1)
     columns = (th.arange(width, device=images.device) + dx[:, None]).clamp(0, width - 1)
     batch = th.arange(n, device=images.device)[:, None, None]

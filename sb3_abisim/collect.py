@@ -69,7 +69,10 @@ def collect(
             raise ValueError(f"{name} must be at least {least}, got {value}")
     folder = Path(folder)
     check_folder(folder)
-    env_kwargs = json.loads(json.dumps(env_kwargs or {}))
+    try:
+        env_kwargs = json.loads(json.dumps(env_kwargs or {}))
+    except TypeError as error:
+        raise ValueError(f"env_kwargs must be what JSON can hold ({error}), got {env_kwargs}") from None
     env = make_vector_env(env_id, n_envs, env_kwargs)
     try:
         return _collect(env, env_id, env_kwargs, n_transitions, folder, seed, progress)
@@ -310,7 +313,7 @@ def main(argv: list[str] | None = None) -> None:
         _import_packages(args.gym_packages)
         env_kwargs = _parse_env_kwargs(args.env_kwargs)
         collect(args.env, args.n, args.o, seed=args.seed, n_envs=args.n_envs, env_kwargs=env_kwargs, progress=True)
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         parser.exit(2, f"collect: error: {error}\n")
     except KeyboardInterrupt:
         parser.exit(130, f"collect: stopped; finished shards are in {args.o}, the same command goes on from there\n")

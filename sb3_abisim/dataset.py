@@ -139,16 +139,18 @@ class TransitionDataset:
         longest = int(self._remaining.max())
         if k > longest:
             raise ValueError(f"no episode of {self.path} has k = {k} steps, the longest has {longest}; lower k")
-        valid = self._remaining >= k
-        if part is not None:
-            valid &= self._held_out() == (part == "test")
-        starts = np.flatnonzero(valid)
+        starts = np.flatnonzero(self._has_steps(k, part))
         if not len(starts):
             raise ValueError(
                 f"no transition of {k} steps in part {part!r} of {self.path} ({len(self._last)} segments, holdout "
                 f"{self.holdout}); collect more transitions or use part=None"
             )
         return starts
+
+    def _has_steps(self, k: int, part: Part | None) -> NDArray[np.bool_]:
+        """Per frame, whether frame t + k belongs to the same episode, of the part."""
+        valid: NDArray[np.bool_] = self._remaining >= k
+        return valid if part is None else valid & (self._held_out() == (part == "test"))
 
     def pairs(self, k: Steps = 1, part: Part | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """All pairs of frames (t, t + steps) of the same episode.
@@ -159,8 +161,11 @@ class TransitionDataset:
         :raises ValueError: if there is none
         """
         fewest, most = (k, k) if isinstance(k, int) else k
+        if fewest > most:
+            raise ValueError(f"k must be the fewest steps and the most, got {list(k)}")  # type: ignore[arg-type]
+        self.valid_starts(fewest, part)  # raises if there is no pair at all
         steps = np.arange(fewest, most + 1)
-        starts = [self.valid_starts(int(n), part) for n in steps]
+        starts = [np.flatnonzero(self._has_steps(int(n), part)) for n in steps]
         return np.concatenate(starts), np.repeat(steps, [len(found) for found in starts])
 
     def frames(self, index: Any) -> NDArray[np.uint8]:

@@ -68,19 +68,19 @@ class _Row:
         self._outcome: Any = None
 
     def __getattr__(self, name: str) -> Any:
+        # While an object is being copied or unpickled, it has no batch yet.
+        if name == "_batch":
+            raise AttributeError(name)
         return getattr(self._batch, name)
 
-    @property
-    def _generators(self) -> list[np.random.Generator]:
-        return [self._batch._generators[self._index]]
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def take_generator(self, generator: np.random.Generator) -> None:
         generators = self._batch._generators
         if not generators:
             generators.extend(seeding.np_random(None)[0] for _ in range(self._batch.num_envs))
+        generators[self._index] = generator
+
+    def reset(self, *, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self._batch._take_options(options or {})
-        if seed is not None:
-            generators[self._index] = seeding.np_random(seed)[0]
         self._batch._begin(self._indices)
         self._needs_reset = False
         return self._batch._observe(self._indices), {}
@@ -108,6 +108,10 @@ class _Row:
         else:
             observation = observations[row]
         return observation, rewards[row], terminated[row], truncated[row], info
+
+    def oracle_actions(self) -> NDArray[np.int64]:
+        actions: NDArray[np.int64] = self._batch.oracle_actions()[self._row]  # type: ignore[attr-defined]
+        return actions
 
     def factors(self) -> dict[str, NDArray[Any]]:
         return {name: array[self._row] for name, array in self._batch.factors().items()}

@@ -54,6 +54,7 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
     :raises ImportError: without Minari, naming the command that installs it
     """
     minari = _import_minari()
+    _check_id(dataset_id)
     dataset = TransitionDataset(folder)
     source = dataset.meta["source"] or {}
     channels_last = bool(source.get("channels_last"))
@@ -78,6 +79,16 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
     identity = {key: dataset.meta[key] for key in IDENTITY_KEYS}
     ours = identity | {"rewards_recorded": False, "content_sha256": content.hexdigest()}
     stored.storage.update_metadata({METADATA_KEY: ours})
+
+
+def _check_id(dataset_id: str) -> None:
+    """Minari would make a folder first, and one with a malformed name stops it from listing any dataset."""
+    from minari.dataset.minari_dataset import parse_dataset_id
+
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):  # TypeError without a version
+        raise ValueError(f"{dataset_id!r} is no name of a Minari dataset; give one such as nav2d/random-v0") from None
 
 
 def import_dataset(dataset_id: str, folder: str | Path) -> str:

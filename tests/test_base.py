@@ -138,6 +138,31 @@ def test_final_info_holds_the_factors_of_the_last_observation():
     assert infos["_final_obs"].all()
 
 
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_np_random_is_the_environments(env_id):
+    """As in Gymnasium's own: its seed is the one in use, and a generator that is put there is used."""
+    env = gym.make(env_id).unwrapped
+    first = env.reset()[0].copy()
+    again = gym.make(env_id).unwrapped
+    assert np.array_equal(again.reset(seed=env.np_random_seed)[0], first)
+    env.np_random = np.random.Generator(np.random.PCG64(4))
+    again.np_random = np.random.Generator(np.random.PCG64(4))
+    assert np.array_equal(env.reset()[0], again.reset()[0])
+    assert env.np_random.random() == again.np_random.random()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [
+        ("PointMaze-v0", "continuous"), ("PointMaze-v0", "momentum"), ("DistractorPointMaze-v0", "recolour"),
+        ("ScanNav-v0", "allow_sliding"),
+    ],
+)  # fmt: skip
+def test_words_are_no_flags(env_id, name):
+    with pytest.raises(ValueError, match=f"{name} must be True or False, got 'no'"):
+        gym.make(env_id, **{name: "no"})
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [({"num_envs": 0}, "num_envs"), ({"num_envs": 2, "max_episode_steps": 0}, "max_episode_steps")],

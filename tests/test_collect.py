@@ -353,6 +353,11 @@ def test_env_kwargs_values_are_literals_or_strings() -> None:
         ({"--gym-packages": "no_such_module"}, "cannot import 'no_such_module'"),
         ({"--env": "PlainEnv-v0", "--env-kwargs": "channels_last:true"}, "channels first"),
         ({"--env": "CartPole-v1"}, "uint8 images"),
+        ({"--env-kwargs": "offset:{1,2}"}, "env_kwargs must be what JSON can hold"),
+        (
+            {"--env": "DistractorPointMaze-v0", "--env-kwargs": "recolour:no"},
+            "recolour must be True or False, got 'no'",
+        ),
     ],
 )
 def test_mistakes_exit_2_with_one_line(

@@ -103,6 +103,14 @@ def test_shift_moves_whole_pictures_and_repeats_the_border():
     assert {dy for dy, _ in found} == {dx for _, dx in found} == {-2, -1, 0, 1, 2}
 
 
+def test_a_small_shift_is_a_pixel_and_none_is_none():
+    th.manual_seed(0)
+    images = ramp(40)
+    assert th.equal(random_shift(images, 0.0), images)
+    moved = (random_shift(images, 0.01) != images).flatten(1).any(dim=1)
+    assert 25 < int(moved.sum()) < 40  # eight of nine
+
+
 def test_crop_enlarges_a_window_within_the_picture():
     th.manual_seed(0)
     images = ramp(30, 16, 16)

@@ -120,6 +120,19 @@ def test_pairs_of_a_range_of_steps_are_all_of_them_once(dataset: TransitionDatas
     assert sorted(visited) == sorted((*pair, k) for pair, k in zip(seen[:, :2].tolist(), steps.tolist(), strict=True))
 
 
+def test_a_range_may_reach_beyond_the_longest_episode(dataset: TransitionDataset) -> None:
+    ends, longest = dataset.ends, index_env.LIMIT
+    expected = {
+        (t, k) for k in (longest - 1, longest) for t in range(dataset.n_frames - k) if not ends[t : t + k].any()
+    }
+    starts, steps = dataset.pairs((longest - 1, longest + 3))
+    assert set(zip(starts.tolist(), steps.tolist(), strict=True)) == expected
+    with pytest.raises(ValueError, match=rf"k = {longest + 1} .* longest has {longest}"):
+        dataset.pairs((longest + 1, longest + 3))
+    with pytest.raises(ValueError, match=r"k must be the fewest steps and the most, got \[4, 2\]"):
+        dataset.pairs((4, 2))
+
+
 def test_sequences_hold_every_action_in_between(dataset: TransitionDataset) -> None:
     n_batches = 0
     for batch in dataset.batches(5, k=3, sequences=True):

@@ -36,6 +36,14 @@ def test_continuous_actions():
         assert audit(frames, actions, paint_action(noise(), actions), 4).best == (0, 0)
 
 
+def test_a_display_of_one_of_two_dimensions_is_a_leak():
+    frames, actions = noise(), GENERATOR.uniform(-1, 1, (400, 2)).astype(np.float32)
+    painted = noise()
+    painted[:, :, :4, :4] = np.rint((actions[:, 1] + 1) * 127).astype(np.uint8)[:, None, None, None]
+    with pytest.warns(ActionLeakWarning, match="rows 0 to 3, columns 0 to 3"):
+        assert audit(frames, actions, painted, 4).best == (0, 0)
+
+
 def test_nav2d_leaks_only_with_a_display():
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -70,6 +70,34 @@ def test_equals_dummy(env_id: str, tmp_path: Path) -> None:
             assert episodes[0] == episodes[1]
 
 
+def test_reset_options_of_one_copy_leave_the_others_alone() -> None:
+    """ScanNav's goals: each copy walks to its own, and knows its own way."""
+    ours, theirs = (make("ScanNav-v0", cls, n_envs=2) for cls in (LockstepVecEnv, DummyVecEnv))
+    theirs.reset()
+    goals = [factors["goal"].tolist() for factors in theirs.env_method("factors")]
+    scenes = [int(factors["scene"]) for factors in theirs.env_method("factors")]
+    for env in (ours, theirs):
+        env.seed(3)
+        env.set_options([{"goal": goal, "scene": scene} for goal, scene in zip(goals, scenes, strict=True)])
+    assert np.array_equal(ours.reset(), theirs.reset())
+    for _ in range(5):
+        assert ours.env_method("oracle_action") == theirs.env_method("oracle_action")
+        actions = np.array(theirs.env_method("oracle_action"))
+        (*arrays, _), (*their_arrays, _) = ours.step(actions), theirs.step(actions)
+        for array, other in zip(arrays, their_arrays, strict=True):
+            assert np.isfinite(array).all() and np.array_equal(array, other)
+
+
+def test_the_generator_is_that_of_each_copy() -> None:
+    """As with ``DummyVecEnv``: what draws from a copy's ``np_random`` moves its episodes."""
+    ours, theirs = (make("Nav2D-v0", cls, n_envs=2) for cls in (LockstepVecEnv, DummyVecEnv))
+    for env in (ours, theirs):
+        env.seed(5)
+        env.reset()
+        env.envs[1].unwrapped.np_random.random(7)
+    assert np.array_equal(ours.reset(), theirs.reset())
+
+
 def test_arguments_and_pictures_reach_the_batch() -> None:
     kwargs = {"env_kwargs": {"layout": "corridor", "render_mode": "rgb_array"}}
     ours, theirs = (make("Nav2D-v0", cls, **kwargs) for cls in (LockstepVecEnv, DummyVecEnv))

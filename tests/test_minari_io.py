@@ -267,6 +267,14 @@ def test_commands(ours: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["nav2d", "bad id", "-v0", "a-v"])
+def test_a_name_that_minari_cannot_have_leaves_nothing_behind(ours: Path, store: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="is no name of a Minari dataset"):
+        export_dataset(ours, name)
+    assert not store.exists() or not list(store.iterdir())
+    assert minari.list_local_datasets() == {}
+
+
 def test_missing_minari_names_the_command_that_installs_it(
     ours: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -160,6 +160,21 @@ def test_npz_round_trip(scan, tmp_path):
     assert again.fingerprint == scan.fingerprint and again.settings == scan.settings and again.origin == scan.origin
 
 
+def test_damage_anywhere_in_a_map_is_one_kind_of_error(scan, tmp_path):
+    scan.save(tmp_path / "map.npz")
+    whole = (tmp_path / "map.npz").read_bytes()
+    generator, refused = np.random.default_rng(0), 0
+    for _ in range(300):
+        place, length = int(generator.integers(len(whole))), int(generator.integers(1, 200))
+        noise = generator.bytes(length) if generator.random() < 0.5 else bytes(length)
+        (tmp_path / "bad.npz").write_bytes((whole[:place] + noise + whole[place + length :])[: len(whole)])
+        try:
+            ScanMap.load(tmp_path / "bad.npz")
+        except SceneError as error:
+            refused += "bad.npz" in str(error)
+    assert refused > 200
+
+
 def test_the_cache_is_used_and_notices_changes(tmp_path, monkeypatch):
     path = write(trimesh.Scene([floor()]), tmp_path / "scan.obj")
     first = ScanMap.from_mesh(path)

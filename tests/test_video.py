@@ -31,10 +31,12 @@ def shade(seed, frame):
     return (40 * seed + 2 * frame) % 250
 
 
-def write_video(path, seed=0, n_frames=64, size=(96, 72), codec="mpeg4"):
+def write_video(path, seed=0, n_frames=64, size=(96, 72), codec="mpeg4", title=None):
     """A video whose frames brighten one by one; black outside of the central square."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
+        if title:
+            container.metadata["title"] = title
         stream = container.add_stream(codec, rate=25)
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"
@@ -71,6 +73,23 @@ def shown(clips, index=0):
 
 
 class TestDecoding:
+    def test_a_title_in_another_encoding_does_no_harm(self, folder):
+        for seed in range(2):
+            path = write_video(folder / f"{seed}.avi", seed, title="CafXX")
+            assert b"CafXX" in path.read_bytes()
+            path.write_bytes(path.read_bytes().replace(b"CafXX", b"Caf\xe9s"))
+        assert [side.lengths.tolist() for side in both(folder)] == [[64], [64]]
+
+    @pytest.mark.parametrize("on_error", ["raise", "skip"])
+    def test_pictures_of_more_than_8_bits_are_refused(self, folder, on_error):
+        for seed in range(4):
+            write_frames(folder / f"clip{seed}", seed)
+        deep = Image.fromarray(np.arange(4800, dtype=np.uint16).reshape(60, 80))
+        for seed in range(4):
+            deep.save(folder / f"clip{seed}" / "frame3.png")
+        with pytest.raises(ValueError, match=r"frame3\.png has more than 8 bits per value \(I;16\)"):
+            load_backgrounds(folder, "train", on_error=on_error)
+
     def test_video_frames_in_order_and_cropped_to_the_centre(self, folder):
         for seed in range(3):
             write_video(folder / f"film{seed}.mp4", seed)
@@ -182,6 +201,22 @@ class TestSplit:
             write_frames(folder / f"clip{i}", i)
         hashes = [{f.tobytes() for i in range(side.n_clips) for f in shown(side, i)} for side in both(folder)]
         assert [len(side) for side in hashes] == [80, 20] and not hashes[0] & hashes[1]
+
+    @pytest.mark.parametrize("unseen", ["val", "valid", "validation", "test"])
+    def test_other_names_of_the_unseen_side(self, folder, unseen):
+        for name in ("train/0.mp4", f"{unseen}/0.mp4", f"{unseen}/1.mp4"):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).touch()
+        sides = listed(folder)
+        assert sorted(sides["train"]) == ["train/0.mp4"]
+        assert sorted(sides["eval"]) == [f"{unseen}/0.mp4", f"{unseen}/1.mp4"]
+
+    def test_links_to_folders_are_followed_once(self, folder, tmp_path):
+        write_frames(tmp_path / "disk" / "far", 1)
+        write_frames(folder / "near", 2)
+        (folder / "linked").symlink_to(tmp_path / "disk")
+        (tmp_path / "disk" / "back").symlink_to(folder)
+        assert [source.name for source in find_sources(folder)] == ["linked/far", "near"]
 
     def test_folders_named_train_and_eval(self, folder):
         for name in ("train/a/0.mp4", "train/b.mp4", "eval/a/0.mp4", "eval/c.mp4", "eval/d.mp4"):

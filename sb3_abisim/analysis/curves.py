@@ -21,7 +21,10 @@ def curves(files: dict[str, EncoderFile]) -> dict[str, Any]:
         path = file.path.with_suffix(".json")
         if not path.is_file():
             raise ValueError(f"{name} has no card {path}, which holds the curves; copy it there as well")
-        all_curves = json.loads(path.read_text())["curves"]
+        try:
+            all_curves = json.loads(path.read_text(encoding="utf-8"))["curves"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"the card {path} is damaged ({error!r}); copy or pretrain it again") from error
         term = next((term for term in TERMS if term in all_curves), None)
         if term is None:
             raise ValueError(f"the card {path} holds none of the curves {', '.join(TERMS)}")

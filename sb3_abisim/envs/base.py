@@ -153,6 +153,13 @@ class BatchEnv(gym.vector.VectorEnv):
         self._needs_reset = False
         return self._observe(self._everyone), {}
 
+    def take_generator(self, generator: np.random.Generator) -> None:
+        """Draw from a given generator, in a batch of one.
+
+        :param generator: :class:`SingleEnv`'s
+        """
+        self._generators = [generator]
+
     def _begin(self, indices: NDArray[np.int64]) -> None:
         self._reset_envs(indices)
         self._elapsed[indices] = 0
@@ -259,9 +266,9 @@ class SingleEnv(gym.Env):
         :param options: none are known, unless the environment says so
         """
         super().reset(seed=seed)
-        observations, _ = self.batch.reset(seed=seed, options=options)
         # One generator: a wrapper that draws from `env.np_random` advances the same stream as the environment.
-        self._np_random = self.batch._generators[0]
+        self.batch.take_generator(self.np_random)
+        observations, _ = self.batch.reset(options=options)
         return one_of(observations, 0), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -294,6 +301,17 @@ def one_of(observations: Any, index: int, copy: bool = False) -> Any:
     if isinstance(observations, dict):
         return {name: one_of(array, index, copy) for name, array in observations.items()}
     return observations[index].copy() if copy else observations[index]
+
+
+def check_flags(**flags: Any) -> None:
+    """Refuse what is neither True nor False, such as the word "no", which would count as True.
+
+    :param flags: arguments by name
+    :raises ValueError: for the first of them
+    """
+    for name, value in flags.items():
+        if not isinstance(value, bool | np.bool_):
+            raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
 def _bounds(space: gym.Space[Any]) -> tuple[Any, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.envs.backgrounds import N_DRAWS, SPLITS, BackgroundPlayer, load_backgrounds
-from sb3_abisim.envs.base import SingleEnv
+from sb3_abisim.envs.base import SingleEnv, check_flags
 from sb3_abisim.envs.point_maze import PointMazeVectorEnv
 
 
@@ -62,6 +62,7 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
             raise ValueError(
                 f"video_kwargs={video_kwargs} applies to your own videos only; give videos= or leave it out"
             )
+        check_flags(recolour=recolour)
         super().__init__(num_envs, **kwargs)
         self._player: BackgroundPlayer | None = None
         if split != "clean":

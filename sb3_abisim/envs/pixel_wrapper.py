@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.envs import top_down
 from sb3_abisim.envs.backgrounds import BackgroundPlayer, Backgrounds, composite
+from sb3_abisim.envs.base import check_flags
 from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE, DiscPainter
 
 GOAL_RADIUS = 0.45  # m, within which gymnasium-robotics counts a success
@@ -67,6 +68,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         self._maze_env: Any = env.unwrapped
         if not hasattr(self._maze_env, "point_env") or not hasattr(self._maze_env, "maze"):
             raise ValueError(f"PointMazePixels wraps the PointMaze ids of gymnasium-robotics, got {env}")
+        check_flags(continuous=continuous, momentum=momentum, recolour=recolour)
         if frame_skip < 1:
             raise ValueError(f"frame_skip must be at least 1, got {frame_skip}")
         self.continuous = continuous

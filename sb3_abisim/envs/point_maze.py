@@ -9,7 +9,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 
 from sb3_abisim.envs import top_down
-from sb3_abisim.envs.base import BatchEnv, SingleEnv
+from sb3_abisim.envs.base import BatchEnv, SingleEnv, check_flags
 from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE
 
 PIXELS_PER_METRE = 4
@@ -257,6 +257,7 @@ class PointMazeVectorEnv(BatchEnv):
         render_mode: str | None = None,
         autoreset: bool = True,
     ) -> None:
+        check_flags(continuous=continuous, momentum=momentum)
         if reward_type not in ("step", "sparse"):
             raise ValueError(f"reward_type must be 'step' or 'sparse', got {reward_type!r}")
         if n_threads < 1:

@@ -8,8 +8,10 @@ and the same picture. :class:`ScanMap` is that picture. It is made once from a m
 import hashlib
 import json
 import os
+import tokenize
 import warnings
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -210,8 +212,14 @@ class ScanMap:
                 )
         except SceneError:
             raise
-        except (OSError, EOFError, KeyError, ValueError, IndexError, TypeError, zipfile.BadZipFile) as error:
+        except _UNREADABLE as error:
             raise SceneError(f"{path} is not a scan map ({error}); copy or write it again") from error
+
+
+# What NumPy raises for damaged files, by where the damage is.
+_UNREADABLE = (
+    OSError, EOFError, KeyError, ValueError, IndexError, TypeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+)  # fmt: skip
 
 
 def _settings(settings: dict[str, Any]) -> MapSettings:

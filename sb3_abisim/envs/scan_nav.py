@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.envs.base import BatchEnv, SingleEnv
+from sb3_abisim.envs.base import BatchEnv, SingleEnv, check_flags
 from sb3_abisim.envs.scan_map import ScanMap
 from sb3_abisim.envs.scan_view import MARKER_RADIUS, MARKERS, MarkerPainter, SceneView
 from sb3_abisim.envs.scan_world import NODE, ScanWorld, StartRule
@@ -101,6 +101,7 @@ class ScanNavVectorEnv(BatchEnv):
         min_ratio: float | None = None,
         goals_per_scene: int = 256,
     ) -> None:
+        check_flags(allow_sliding=allow_sliding)
         _check_choice("obs_mode", obs_mode, OBS_MODES)
         _check_choice("marker", marker, tuple(MARKERS))
         _check_choice("stop", stop, ("action", "auto"))
@@ -175,7 +176,7 @@ class ScanNavVectorEnv(BatchEnv):
         options, self._options = self._options, {}
         world = self._world
         if "goal" in options:
-            self._place_goal(options)
+            self._place_goal(options, indices)
         for i in indices.tolist():
             generator = self._generators[i]
             scene, k = int(generator.integers(len(self.scans))), int(generator.integers(world.n_goals))
@@ -196,10 +197,10 @@ class ScanNavVectorEnv(BatchEnv):
         self._path[indices] = 0
         self._success[indices] = self._collided[indices] = False
 
-    def _place_goal(self, options: dict[str, Any]) -> None:
+    def _place_goal(self, options: dict[str, Any], indices: NDArray[np.int64]) -> None:
         """Place the goal that reset is asked for, and refuse one without starts, or a start without a way."""
-        world, scene, own = self._world, int(options["scene"]), self._world.own[:1]
-        world.place_goal(scene, np.array(options["goal"], dtype=np.float64))
+        world, scene, own = self._world, int(options["scene"]), self._world.own[indices[:1]]
+        world.place_goal(scene, np.array(options["goal"], dtype=np.float64), indices)
         if "start" not in options:
             if not world.has_starts(int(own[0])):
                 raise ValueError(
@@ -344,8 +345,7 @@ class ScanNavEnv(SingleEnv):
 
     def oracle_action(self) -> int:
         """See :meth:`ScanNavVectorEnv.oracle_actions`."""
-        assert isinstance(self.batch, ScanNavVectorEnv)
-        return int(self.batch.oracle_actions()[0])
+        return int(self.batch.oracle_actions()[0])  # type: ignore[attr-defined]
 
 
 def load_scene(scene: Scene) -> ScanMap:

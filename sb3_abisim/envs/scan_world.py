@@ -174,18 +174,20 @@ class ScanWorld:
             "view_size, or take another scan"
         )
 
-    def place_goal(self, scene: int, goal: NDArray[np.float64]) -> None:
-        """Make a point the goal of all own fields.
+    def place_goal(self, scene: int, goal: NDArray[np.float64], copies: NDArray[np.int64]) -> None:
+        """Make a point the goal of some copies' own fields.
 
         :param scene: index
         :param goal: x and y in m, in the scan's coordinates; moved to the nearest corner of a pixel
+        :param copies: indices
         :raises ValueError: where one cannot walk there
         """
         corner = self.corners_at(np.array([scene]), goal[None])[0]
         distances = self._compute(scene, corner)
         if not np.isfinite(distances[self._middle, self._middle]):
             raise ValueError(f"the goal {goal.tolist()} is not on the walkable floor of {self.scans[scene].source}")
-        self._fields[self.own], self.corners[self.own] = distances, corner
+        own = self.own[copies]
+        self._fields[own], self.corners[own] = distances, corner
 
     def goal_positions(self, scenes: NDArray[np.int64], fields: NDArray[np.int64]) -> NDArray[np.float64]:
         """x and y of goals in m, in the scans' coordinates, (n, 2).

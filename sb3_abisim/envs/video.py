@@ -51,7 +51,8 @@ def decode_video(path: Path) -> Iterator["Image.Image"]:
     av = _import_decoder("av")
     count = 0
     try:
-        with av.open(str(path)) as container:
+        # Titles and the like may be in any encoding.
+        with av.open(str(path), metadata_errors="ignore") as container:
             promised, share = _promise(container, path)
             container.streams.video[0].thread_type = "AUTO"
             for frame in container.decode(video=0):
@@ -91,8 +92,12 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
     for file in source.files:
         try:
             with image_module.open(file) as image:
+                if image.mode.startswith(("I", "F")):
+                    raise ClipError(
+                        f"{file} has more than 8 bits per value ({image.mode}); convert {source.path} to 8 bits"
+                    )
                 yield image.convert("RGB")
-        except (OSError, SyntaxError) as error:
+        except (OSError, SyntaxError, image_module.DecompressionBombError) as error:
             raise ClipError(f"{file} cannot be decoded ({error}); replace the file or remove {source.path}") from error
 
 
@@ -209,7 +214,7 @@ class _Entry:
             return len(self.source.files)
         av = _import_decoder("av")
         try:
-            with av.open(str(self.source.path)) as container:
+            with av.open(str(self.source.path), metadata_errors="ignore") as container:
                 return _promise(container, self.source.path)[0] or 0
         except (ClipError, av.FFmpegError):
             return 0  # decoding will say what is wrong

@@ -16,6 +16,8 @@ VIDEO_SUFFIXES = (".avi", ".gif", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".webp")
 # yt-dlp writes "title [id].mp4", Kinetics "id_000010_000020.mp4".
 _YOUTUBE_ID = re.compile(r"\[([\w-]{11})\]|^([\w-]{11})_\d{6}_\d{6}$")
+# Beside a folder "train".
+UNSEEN_FOLDERS = ("eval", "val", "valid", "validation", "test")
 _DAVIS_LISTS = {"train": "train.txt", "eval": "val.txt"}
 
 
@@ -56,7 +58,8 @@ def natural_key(name: str) -> list[Any]:
 def find_sources(root: Path) -> tuple[Source, ...]:
     """All clips in a folder, sorted by name.
 
-    ``root/train`` and ``root/eval``, where both exist, are taken as the split. Hidden files are left out, and so are
+    ``root/train`` and ``root/eval`` (or :data:`UNSEEN_FOLDERS`), where both exist, are taken as the split. Links to
+    folders are followed. Hidden files are left out, and so are
     pictures beside video files (their thumbnails).
 
     :param root: the folder
@@ -68,8 +71,9 @@ def find_sources(root: Path) -> tuple[Source, ...]:
         raise ValueError(f"{root} is a file; give the folder with your videos, at least two, one for each of {SPLITS}")
     if (root / "JPEGImages" / "480p").is_dir():
         return _find_davis(root)
-    if all((root / side).is_dir() for side in SPLITS):
-        sources = [source for side in SPLITS for source in _find(root / side, side)]
+    unseen = [root / name for name in UNSEEN_FOLDERS if (root / name).is_dir()]
+    if (root / "train").is_dir() and unseen:
+        sources = _find(root / "train", "train") + [source for folder in unseen for source in _find(folder, "eval")]
     else:
         sources = _find(root, None)
     if not sources:
@@ -83,10 +87,15 @@ def find_sources(root: Path) -> tuple[Source, ...]:
 
 
 def _find(root: Path, split: str | None) -> list[Source]:
-    prefix = f"{split}/" if split else ""
+    prefix = f"{root.name}/" if split else ""
     sources = []
-    for folder, subfolders, names in os.walk(root):
-        subfolders[:] = [name for name in subfolders if not name.startswith(".")]
+    seen = {root.resolve()}
+    for folder, subfolders, names in os.walk(root, followlinks=True):
+        subfolders[:] = [name for name in sorted(subfolders) if not name.startswith(".")]
+        # Links may lead back.
+        places = {name: (Path(folder) / name).resolve() for name in subfolders}
+        subfolders[:] = [name for name, place in places.items() if place not in seen]
+        seen |= set(places.values())
         visible = sorted((name for name in names if not name.startswith(".")), key=natural_key)
         here = Path(folder)
         videos = [here / name for name in visible if name.lower().endswith(VIDEO_SUFFIXES)]
