@@ -94,6 +94,8 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(argv)
     if importlib.util.find_spec("PIL") is None:
         parser.error("Pillow is not installed; run: pip install 'sb3_abisim[plots]'")
+    if not args.output.absolute().parent.is_dir():
+        parser.error(f"there is no folder {args.output.parent} for {args.output.name}; make it first")
     try:
         success = film(args.run, args.output, args.episodes, args.seed)
     except ValueError as error:

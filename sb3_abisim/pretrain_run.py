@@ -78,7 +78,7 @@ class PretrainRun:
         self.module: Objective = module.to(self.device, memory_format=th.channels_last)  # type: ignore[call-overload]
         self._trained = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
         self.optimizer = th.optim.Adam(self._trained, lr=config.learning_rate_at(0))
-        self.n_updates = 0
+        self.n_updates = self._saved_at = 0
         self.rows: list[dict[str, float]] = []
 
     # Position and files.
@@ -98,6 +98,7 @@ class PretrainRun:
         path = self.folder / f"checkpoint-{self.n_updates:09d}.safetensors"
         metadata = {"n_updates": self.n_updates, "settings": self.settings, "rows": self.rows}
         save_training_state(path, self.module, self.optimizer, metadata)
+        self._saved_at = self.n_updates
         for old in self._checkpoints()[:-2]:
             old.unlink()
 
@@ -108,6 +109,7 @@ class PretrainRun:
             return
         metadata = load_training_state(checkpoints[-1], self.module, self.optimizer, self.settings)
         self.n_updates, self.rows = metadata["n_updates"], metadata["rows"]
+        self._saved_at = self.n_updates
 
     def _checkpoints(self) -> list[Path]:
         return sorted(self.folder.glob("checkpoint-*.safetensors"))
@@ -208,12 +210,12 @@ class PretrainRun:
                 for name, value in terms.items():
                     sums[name] = sums.get(name, 0.0) + float(value)
                 bar.update()
-                if self.n_updates % self.config.log_interval == 0:
-                    self._log(logger, sums)
-                    sums = {}
+                if self.n_updates % self.config.log_interval and self.n_updates < self.config.n_updates:
+                    continue
+                self._log(logger, sums)
+                sums = {}
                 # A checkpoint falls on a row of the log, so that no half-filled sums need saving.
-                due = self.n_updates % self.config.checkpoint_interval == 0
-                if due and self.n_updates % self.config.log_interval == 0:
+                if self.n_updates - self._saved_at >= self.config.checkpoint_interval:
                     self.save()
         finally:
             bar.close()
@@ -282,7 +284,8 @@ class PretrainRun:
         return TensorBatch(observations, th.as_tensor(batch.actions).to(self.device), now, later)
 
     def _log(self, logger: Logger, sums: dict[str, float]) -> None:
-        row = {f"train/{name}": value / self.config.log_interval for name, value in sums.items()}
+        n = self.n_updates - (int(self.rows[-1]["n_updates"]) if self.rows else 0)
+        row = {f"train/{name}": value / n for name, value in sums.items()}
         row |= {f"test/{name}": value for name, value in self._evaluate().items()}
         row |= self._called_back()
         self.rows.append({"n_updates": self.n_updates, **row})

@@ -210,6 +210,11 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
                 raise ValueError(f"-params {name} would undo --conf-file {method.name}; give one of the two")
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = original(self)
+        if encoding_kwargs(hyperparams) is not None and _normalizes_observations(hyperparams.get("normalize", False)):
+            raise ValueError(
+                f"normalize={hyperparams['normalize']!r} would change the embeddings of the frozen encoder; give "
+                '"dict(norm_obs=False, norm_reward=True)"'
+            )
         if hyperparams.get("n_envs", 1) > 1 and "env_wrapper" not in hyperparams:
             self.vec_env_class = _in_lockstep(self.vec_env_class)
         # Hyperparameters are selected on the training clips, so that evaluation clips stay unseen.
@@ -221,6 +226,13 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
         return hyperparams, saved_hyperparams
 
     return read_hyperparameters
+
+
+def _normalizes_observations(normalize: Any) -> bool:
+    """Whether the zoo's ``normalize`` (a bool, or the text of a dictionary) makes VecNormalize change observations."""
+    if isinstance(normalize, dict):
+        return bool(normalize.get("norm_obs", True))
+    return bool(normalize) and re.search(r"norm_obs['\"]?\s*[=:]\s*False", str(normalize)) is None
 
 
 def _test_env_maker(original: Callable[..., Any]) -> Callable[..., Any]:

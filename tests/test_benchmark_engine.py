@@ -103,6 +103,17 @@ def test_a_cell_in_a_program_of_its_own(tmp_path: Path) -> None:
     assert list(errors) == ["bad"] and str(tmp_path / "logs" / f"{bad.name}.log") in errors["bad"]
 
 
+def test_a_damaged_encoder_is_made_again(tmp_path: Path) -> None:
+    """Pretraining would refuse to touch it, so it is put aside."""
+    one = cell("one", command=("json.tool", "--no-ensure-ascii", "one.json", "one.zip"))
+    (tmp_path / "one.json").write_text("{}")
+    assert run_cells(tmp_path, [one], LocalEngine(1), progress=False) == {}
+    whole = (tmp_path / "one.zip").read_bytes()
+    (tmp_path / "one.zip").write_bytes(b"damaged")
+    assert run_cells(tmp_path, [one], LocalEngine(1), progress=False) == {}
+    assert (tmp_path / "one.zip").read_bytes() == whole and (tmp_path / "one.damaged").read_bytes() == b"damaged"
+
+
 def test_cells_of_other_code_are_kept_and_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run_cells(tmp_path, CELLS, FakeEngine(), progress=False)
     sources = {"a": None, "b": source_digest("encoder"), "c": "other", "d": "other"}

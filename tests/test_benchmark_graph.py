@@ -156,6 +156,8 @@ def test_distractors_are_evaluated_on_three_splits() -> None:
         ({"seeds": (-1,)}, "seeds must be at least 0, got -1"),
         ({"n_timesteps": 0}, "n_timesteps must be at least 1, got 0"),
         ({"algo": "sac"}, "no hyperparameters of sac for Nav2D-v0"),
+        ({"params": ("sac.gamma:0.9",)}, "--params sac.gamma:0.9 is for sac, but here is only dqn, ppo"),
+        ({"pretrain_params": ("curl.n_updates:3",)}, "curl.n_updates:3 is for curl, but here is only abisim, ssi"),
         ({"params": ("gamma",)}, "name:value, got 'gamma'"),
         ({"pretrain_params": ("n_update:3",)}, "unknown pretraining setting n_update"),
     ],

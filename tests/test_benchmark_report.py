@@ -14,9 +14,9 @@ from PIL import Image
 
 from sb3_abisim.benchmark import statistics
 from sb3_abisim.benchmark.__main__ import main
-from sb3_abisim.benchmark.comparison import compare
+from sb3_abisim.benchmark.comparison import compare, split_label
 from sb3_abisim.benchmark.figures import MINUS
-from sb3_abisim.benchmark.report import report
+from sb3_abisim.benchmark.report import _verdict, report
 from sb3_abisim.benchmark.runs import find_runs, read_run
 
 STEPS = list(range(1000, 11_000, 1000))
@@ -158,6 +158,69 @@ def test_the_same_runs_give_the_same_files(made: Path, logs: Path, tmp_path: Pat
     report([str(logs)], tmp_path)
     for path in sorted(made.iterdir()):
         assert (tmp_path / path.name).read_bytes() == path.read_bytes(), path.name
+
+
+def test_scan_navs_returns_are_no_costs_of_steps(tmp_path: Path) -> None:
+    for seed in range(2):
+        write_run(tmp_path, "ScanNav-v0", "abisim", seed, [100, 200, 300], np.array([[-1.0], [2.0], [5.0]]))
+        write_run(tmp_path, "ScanNav-v0", "vanilla", seed, [100, 200, 300], np.array([[-3.0], [-3.0], [-3.0]]))
+    made = compare([str(tmp_path)], thresholds=[0.5])
+    assert made.thresholds[0]["return"] == 1.0
+    assert (made.thresholds[0]["reached_reference"], made.thresholds[0]["reached_baseline"]) == (2, 0)
+    assert any("lowest and highest mean return of these runs (-3.0, 5.0)" in note for note in made.notes)
+
+
+@pytest.mark.parametrize(
+    ("bound", "low", "high", "verdict"),
+    [
+        ("", 0.2, 0.8, "fewer"), ("<=", 0.2, 0.8, "fewer"), (">=", 0.2, 0.8, "no clear difference"),
+        ("", 1.2, 1.8, "more"), (">=", 1.2, 1.8, "more"), ("<=", 1.2, 1.8, "no clear difference"),
+        ("~", 0.2, 0.8, "no clear difference"), ("", 0.8, 1.2, "no clear difference"),
+    ],
+)  # fmt: skip
+def test_a_bound_says_less_than_a_number(bound: str, low: float, high: float, verdict: str) -> None:
+    assert _verdict({"bound": bound, "low": low, "high": high}) == verdict
+
+
+def test_a_run_that_was_stopped_is_named(tmp_path: Path) -> None:
+    for seed, n in ((0, 10), (1, 3)):
+        write_run(tmp_path, "PointMaze-v0", "abisim", seed, STEPS[:n], np.zeros((n, 2)), n_timesteps=10_000)
+    notes = compare([str(tmp_path)]).notes
+    assert any("PointMaze-v0_2 ends at step 3,000 of 10,000" in note for note in notes)
+    assert not any("PointMaze-v0_1 ends" in note for note in notes)
+
+
+def test_runs_with_other_networks_are_not_one_method(tmp_path: Path) -> None:
+    runs = [write_run(tmp_path, "PointMaze-v0", "abisim", seed, [100], np.zeros((1, 2))) for seed in range(2)]
+    config = runs[1] / "PointMaze-v0" / "config.yml"
+    config.write_text(config.read_text().replace("dict(", "dict(net_arch=[8], ", 1))
+    with pytest.raises(ValueError, match="are both abisim but differ in policy_kwargs"):
+        compare([str(tmp_path)])
+
+
+def test_files_of_an_earlier_report_go(logs: Path, tmp_path: Path) -> None:
+    report([str(logs)], tmp_path)
+    (tmp_path / "mine.csv").write_text("kept")
+    report([str(logs / "abisim")], tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert "curves.csv" in names and "mine.csv" in names and not names & {"thresholds.csv", "thresholds.png"}
+
+
+def test_folders_with_an_equals_sign(tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / "c=0.5"
+    write_run(folder, "PointMaze-v0", "abisim", 0, [100, 200], np.zeros((2, 2)))
+    assert report([str(folder)]).parent == folder / "report"
+    assert split_label(f"c=half={folder}") == ("c=half", str(folder))
+    assert split_label("a=nowhere=b") == ("a", "nowhere=b")
+    assert list(compare([f"mine={folder}"]).groups["PointMaze-v0"]) == ["mine"]
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"nonsense"])
+def test_evaluations_that_are_being_written(tmp_path: Path, content: bytes) -> None:
+    run = write_run(tmp_path, "PointMaze-v0", "abisim", 0, [100], np.zeros((1, 2)))
+    (run / "evaluations.npz").write_bytes(content)
+    with pytest.raises(ValueError, match=r"evaluations\.npz is damaged or being written"):
+        compare([str(tmp_path)])
 
 
 def test_training_episodes_as_source(tmp_path: Path) -> None:

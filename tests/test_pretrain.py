@@ -232,6 +232,19 @@ def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
             run(data, tmp_path / "ssi.safetensors")
 
 
+@pytest.mark.parametrize(("log_interval", "n_rows", "saved"), [(7, 5, [14, 28]), (30, 1, [30]), (100, 1, [30])])
+def test_checkpoints_and_rows_come_whatever_the_intervals(data, tmp_path, monkeypatch, log_interval, n_rows, saved):
+    """At the first row after each interval; the last row is at the end."""
+    from sb3_abisim.pretrain_run import PretrainRun
+
+    positions, plain = [], PretrainRun.save
+    monkeypatch.setattr(PretrainRun, "save", lambda run: positions.append(run.n_updates) or plain(run))
+    run(data, tmp_path / "e.safetensors", log_interval=log_interval, checkpoint_interval=10)
+    rows = json.loads((tmp_path / "e.json").read_text())["curves"]
+    assert positions == saved and len(rows["n_updates"]) == n_rows and rows["n_updates"][-1] == 30
+    assert all(0 <= accuracy <= 1 for accuracy in rows["train/accuracy"]), "means over the updates of a row"
+
+
 def test_keeps_the_last_two_checkpoints(data, tmp_path, monkeypatch):
     from sb3_abisim.pretrain_run import PretrainRun
 

@@ -225,6 +225,9 @@ def test_mistakes_are_refused(manager: Any) -> None:
         manager("ppo", "Nav2D-v0", "ssi", hyperparams={"policy_kwargs": "dict()"}).read_hyperparameters()
     with pytest.raises(ValueError, match="-params vec_env_wrapper would undo"):
         manager("ppo", "Nav2D-v0", "ssi,frozen", hyperparams={"vec_env_wrapper": []}).read_hyperparameters()
+    for normalize in (True, "dict(norm_reward=False)", "{'norm_obs': True}"):
+        with pytest.raises(ValueError, match="would change the embeddings of the frozen encoder"):
+            manager("ppo", "Nav2D-v0", "ssi,frozen", hyperparams={"normalize": normalize}).read_hyperparameters()
     with pytest.raises(ValueError, match="--trial-id would replace policy_kwargs"):
         manager("ppo", "Nav2D-v0", trial_id=3).read_hyperparameters()
     with pytest.raises(ValueError, match=r"abisim=mine\.safetensors needs hyperparameters of ours, which CartPole-v1"):

@@ -4,7 +4,9 @@ import argparse
 import dataclasses
 import importlib.util
 import json
+import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_abisim.atomic import write_atomic
@@ -33,7 +35,7 @@ def main(argv: list[str] | None = None) -> None:
     args = parser.parse_args(rest)
     try:
         run(args)
-    except (ValueError, FileNotFoundError) as error:
+    except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
         parser.error(str(error))
     except KeyboardInterrupt:
         parser.exit(130, "stopped; the same command goes on with the cells that are missing\n")
@@ -229,12 +231,23 @@ def _sweep(args: argparse.Namespace) -> None:
     best = best_of(trials)
     if best is not None:
         print(f"best is trial {best.number + 1}, {args.metric} {best.value:.2f}: {' '.join(best.encoders)}")
-        words = " ".join([*args.pretrain_params, *best.words])
-        print(f"python -m sb3_abisim.benchmark --methods {args.method} --env {args.env} --pretrain-params {words}")
+        print(_comparing_command(args, best.words))
     n_failed = sum(not trial.returns for trial in trials)
     if n_failed:
         print(f"{n_failed} trials failed; the logs are in {root / 'logs'}", file=sys.stderr)
         sys.exit(1)
+
+
+def _comparing_command(args: argparse.Namespace, words: Sequence[str]) -> str:
+    """A benchmark of the best trial beside learning from scratch, in the sweep's folder and with its budget."""
+    command = ["python", "-m", "sb3_abisim.benchmark", "-o", args.output, "--env", args.env]
+    command += ["--methods", args.method, "vanilla", "--seeds", *map(str, args.seeds)]
+    names = "encoder_seeds algo n_transitions n_timesteps eval_freq eval_episodes n_eval_envs params"
+    for name in names.split():
+        value = getattr(args, name)
+        if value:
+            command += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, list) else [value])]
+    return shlex.join([*command, "--pretrain-params", *args.pretrain_params, *words])
 
 
 COMMANDS = {

@@ -163,6 +163,11 @@ def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
         for leftover in work.iterdir():
             if leftover.is_dir():
                 shutil.rmtree(leftover)
+    if cell["kind"] == "encoder" and output.is_file() and marker_path(root, cell["name"]).is_file():
+        # Not as it was made; pretraining would find it finished and refuse it.
+        damaged = output.with_suffix(".damaged")
+        output.rename(damaged)
+        print(f"{output} is not as it was made; it is now {damaged}", flush=True)
     start, source = time.monotonic(), source_digest(cell["kind"])
     print(f"$ python -m {' '.join(cell['command'])}", flush=True)
     code = subprocess.run([sys.executable, "-m", *cell["command"]], stdin=subprocess.DEVNULL).returncode

@@ -145,12 +145,23 @@ def compare(
 def _labelled_runs(folders: Sequence[str]) -> list[Run]:
     runs: list[Run] = []
     for word in folders:
-        label, equals, folder = word.rpartition("=")
-        if equals and not Path(word).exists():
-            runs += [dataclasses.replace(run, label=label) for run in find_runs(folder)]
-        else:
-            runs += find_runs(word)
+        label, folder = split_label(word)
+        found = find_runs(folder)
+        runs += found if label is None else [dataclasses.replace(run, label=label) for run in found]
     return runs
+
+
+def split_label(word: str) -> tuple[str | None, str]:
+    """The label and the folder of ``LABEL=FOLDER``; both may hold further "=".
+
+    :param word: a folder, or ``LABEL=FOLDER``
+    :return: the label, None for a plain folder, and the folder
+    """
+    places = [] if Path(word).exists() else [place for place, letter in enumerate(word) if letter == "="]
+    for place in places:
+        if Path(word[place + 1 :]).exists():
+            return word[:place], word[place + 1 :]
+    return (word[: places[0]], word[places[0] + 1 :]) if places else (None, word)
 
 
 def _groups(all_runs: list[Run], source: str, reference: str, notes: list[str]) -> dict[str, dict[str, Group]]:
@@ -162,6 +173,8 @@ def _groups(all_runs: list[Run], source: str, reference: str, notes: list[str]) 
     for env_id in order:
         runs = [run for method in found[env_id].values() for run in method]
         curves = {run.folder: run.evaluations() if source == "evaluations" else run.training() for run in runs}
+        for run in runs:
+            _note_unfinished(run, curves[run.folder], notes)
         low, high = _bounds(env_id, runs, list(curves.values()), notes)
         groups[env_id] = {}
         for label in sorted(found[env_id], key=lambda name: name != reference):
@@ -181,6 +194,16 @@ def _groups(all_runs: list[Run], source: str, reference: str, notes: list[str]) 
     return groups
 
 
+def _note_unfinished(run: Run, curve: Curve, notes: list[str]) -> None:
+    """A run that was stopped looks like any other, and everything is compared up to its last step."""
+    longest = int(np.diff(curve.steps, prepend=0).max())
+    if curve.steps[-1] + 2 * longest < run.n_timesteps:
+        notes.append(
+            f"{run.env_id}: {run.folder} ends at step {int(curve.steps[-1]):,} of {run.n_timesteps:,}, and no run is "
+            "compared beyond; let it end, or leave it out."
+        )
+
+
 def _check_alike(runs: list[Run]) -> None:
     """Runs of one method must differ in seeds alone, or their mean says nothing."""
     hint = "compare them under names of your own: LABEL=FOLDER"
@@ -196,8 +219,9 @@ def _check_alike(runs: list[Run]) -> None:
 
 
 def _bounds(env_id: str, runs: list[Run], curves: list[Curve], notes: list[str]) -> tuple[float, float]:
-    """The returns that count as 0 and 1: ours cost one per step until the goal."""
-    limit = gym.registry[env_id].max_episode_steps if env_id in ENV_IDS else None
+    """The returns that count as 0 and 1: in most of our environments, each step costs one until the goal."""
+    costs_steps = env_id in ENV_IDS and not env_id.startswith("ScanNav")
+    limit = gym.registry[env_id].max_episode_steps if costs_steps else None
     if limit is not None and not any(run.env_kwargs.keys() - {"split", "clips", "videos"} for run in runs):
         return -float(limit), 0.0
     low, high = min(float(c.returns.min()) for c in curves), max(float(c.returns.max()) for c in curves)

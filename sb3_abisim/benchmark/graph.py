@@ -23,6 +23,7 @@ from sb3_abisim.pretrain import OBJECTIVE_NAMES, parse_overrides
 from sb3_abisim.pretrain_config import load_config
 from sb3_abisim.zoo import DISTRACTOR_IDS, UNTRAINED, Method, hyperparameters_file
 
+ALGOS = ("ppo", "dqn", "sac")
 # The paper's Table of data: random-action transitions for pretraining.
 PAPER_N_TRANSITIONS = {"Nav2D": 1_000_000, "PointMaze": 250_000, "ScanNav": 100_000}
 # A random agent that may stop does so after four steps.
@@ -153,7 +154,21 @@ def build(plan: Plan) -> list[Cell]:
                 named = Method.parse(method.replace("{seed}", str(encoder_seed)))
                 run = run_cell(plan, env_id, named, seed, encoder_seed)
                 add(final_cell(plan, run) if plan.final_episodes else run)
+    _check_owners(plan, list(cells.values()))
     return list(cells.values())
+
+
+def _check_owners(plan: Plan, cells: list[Cell]) -> None:
+    """Refuse settings for an algorithm or objective that no cell has."""
+    for option, words, field, owners in (
+        ("--params", plan.params, "algo", ALGOS),
+        ("--pretrain-params", plan.pretrain_params, "objective", OBJECTIVE_NAMES),
+    ):
+        used = {cell.settings[field] for cell in cells if field in cell.settings}
+        for word in words:
+            head, dot, _ = word.partition(".")
+            if dot and head in owners and head not in used:
+                raise ValueError(f"{option} {word} is for {head}, but here is only {', '.join(sorted(used)) or 'none'}")
 
 
 def data_cell(plan: Plan, env_id: str) -> Cell:
@@ -200,7 +215,7 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
     :param encoder_seed: of pretraining; of no effect where nothing is pretrained
     """
     algo = plan.algo or ("dqn" if env_id.startswith("Nav2D") else "ppo")
-    words = _params_of(plan.params, algo, ("ppo", "dqn", "sac"))
+    words = _params_of(plan.params, algo, ALGOS)
     entry = yaml.safe_load(hyperparameters_file(algo, env_id).read_text(encoding="utf-8"))[env_id]
     n = plan.n_timesteps or int(entry["n_timesteps"])
     eval_freq = plan.eval_freq or min(PAPER_EVAL_FREQ, max(n // 100, 1))

@@ -12,7 +12,7 @@ from typing import Any
 from sb3_abisim._version import __version__
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark import statistics
-from sb3_abisim.benchmark.comparison import Comparison, Row, compare
+from sb3_abisim.benchmark.comparison import Comparison, Row, compare, split_label
 from sb3_abisim.benchmark.figures import MINUS, SPLIT_NAMES, draw, level_text
 from sb3_abisim.benchmark.runs import Run, is_deterministic
 from sb3_abisim.zoo import DISTRACTOR_IDS
@@ -26,6 +26,8 @@ METHOD_NAMES = {
     "info_nce": "InfoNCE",
     "vanilla": "trained from scratch",
 }
+# Each a table, a picture or both, where there are numbers for it.
+PARTS = ("curves", "final", "thresholds", "splits", "aggregates", "profiles", "improvement")
 BOUND_SIGNS = {"": "", "<=": "≤ ", ">=": "≥ ", "~": "≈ "}
 
 
@@ -49,17 +51,20 @@ def report(
     :return: the page
     :raises ValueError: if the runs cannot be compared
     """
-    folder = Path(output) if output is not None else Path(folders[0].rpartition("=")[2]) / "report"
+    folder = Path(output) if output is not None else Path(split_label(folders[0])[1]) / "report"
     comparison = compare(folders, source, reference, thresholds, seed)
     pictures = draw(comparison)
     page = render(comparison, pictures)
     folder.mkdir(parents=True, exist_ok=True)
     files = {f"{name}.png": picture for name, picture in pictures.items()}
-    for name in ("curves", "final", "thresholds", "aggregates", "profiles", "improvement"):
-        rows = getattr(comparison, name)
+    for name in PARTS:
+        rows = getattr(comparison, name, None)
         if rows:
             files[f"{name}.csv"] = _csv(rows)
     files["index.html"] = page.encode()
+    for name in {f"{part}.{suffix}" for part in PARTS for suffix in ("csv", "png")} - set(files):
+        # Of an earlier report, which does not belong beside this page.
+        (folder / name).unlink(missing_ok=True)
     for name, content in files.items():
         write_atomic(folder / name, lambda file, content=content: file.write(content))  # type: ignore[misc]
     return folder / "index.html"
@@ -182,10 +187,13 @@ def _sentence(row: Row) -> str:
 def _verdict(row: Row) -> str:
     if not math.isfinite(row["low"]):
         return "one run, no interval"
-    if row["high"] < 1:
+    # Where the baseline did not always arrive, the true ratio is smaller than the interval says; where the reference
+    # did not, larger.
+    if row["high"] < 1 and row["bound"] in ("", "<="):
         return "fewer"
-    # Where the baseline did not always arrive, the true ratio is smaller than the interval says.
-    return "more" if row["low"] > 1 and not row["bound"] else "no clear difference"
+    if row["low"] > 1 and row["bound"] in ("", ">="):
+        return "more"
+    return "no clear difference"
 
 
 def _final_table(comparison: Comparison) -> list[dict[str, Any]]:

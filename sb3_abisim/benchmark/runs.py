@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import re
+import zipfile
+import zlib
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -22,10 +24,15 @@ _Loader.add_constructor(
     "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
     lambda loader, node: OrderedDict(*loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
 )
+# Of a class or function, its name.
+_Loader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda loader, suffix, node: suffix)
 _Loader.add_constructor(
     "tag:yaml.org,2002:python/tuple",
     lambda loader, node: tuple(loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
 )
+
+
+_ENCODER_NAME = re.compile(r"""['"]encoder['"]\s*:\s*(['"]).*?\1""")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,9 +84,14 @@ class Run:
         path = self.folder / "evaluations.npz"
         if not path.is_file():
             raise ValueError(f"{self.folder} holds no evaluations.npz; train with an --eval-freq above 0")
-        data = np.load(path, allow_pickle=False)
-        successes = data["successes"].mean(axis=1) if "successes" in data else None
-        return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
+        try:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
+                successes = data["successes"].mean(axis=1) if "successes" in data else None
+                return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+            raise ValueError(
+                f"{path} is damaged or being written ({error!r}); try again, or leave the run out"
+            ) from error
 
     def training(self, n_points: int = 200) -> Curve:
         """The episodes of training itself, with the exploring policy, averaged over equal stretches of steps.
@@ -94,6 +106,8 @@ class Run:
             raise ValueError(f"{what}; take --source evaluations, or the original folder")
         # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
         episodes = load_results(str(self.folder))
+        if not len(episodes):
+            raise ValueError(f"no episode of {self.folder} has ended yet; try again later, or leave the run out")
         ends = episodes["l"].cumsum().to_numpy()
         stretch = np.minimum((ends - 1) * n_points // max(self.n_timesteps, int(ends[-1])), n_points - 1)
         width = max(self.n_timesteps, int(ends[-1])) / n_points
@@ -125,6 +139,7 @@ def read_run(folder: str | Path) -> Run:
         # What names the encoder's file differs between encoder seeds; the label says whatever else is in there.
         plain = {name: value for name, value in config.items() if name not in ("policy_kwargs", "n_timesteps")}
         (encoding_kwargs(plain) or {}).pop("encoder", None)
+        plain["policy_kwargs"] = _ENCODER_NAME.sub("'encoder': ...", str(config.get("policy_kwargs", "")))
         names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
         return Run(
             folder=folder,
