@@ -148,7 +148,8 @@ def test_np_random_is_the_environments(env_id):
     env.np_random = np.random.Generator(np.random.PCG64(4))
     again.np_random = np.random.Generator(np.random.PCG64(4))
     assert np.array_equal(env.reset()[0], again.reset()[0])
-    assert env.np_random.random() == again.np_random.random()
+    untouched = np.random.Generator(np.random.PCG64(4)).random()
+    assert env.np_random.random() == again.np_random.random() != untouched
 
 
 @pytest.mark.parametrize(
