@@ -119,3 +119,14 @@ def test_all_makes_the_usual_ones(monkeypatch, tmp_path):
     analyze.main(["all", "--images", str(tmp_path)])
     assert made[0] == ("sweep", (0.25, 0.75, 0.85, 0.99), analyze.SWEEP_LAYOUTS)
     assert made[1:] == [(name, env_id, one.size) for name, one in FIGURES.items() for env_id in one.usual_ids]
+
+
+@pytest.mark.parametrize("content", ["{", "{}", "[]"])
+def test_a_damaged_card_is_named(tmp_path, content):
+    from types import SimpleNamespace
+
+    from sb3_abisim.analysis.curves import curves
+
+    (tmp_path / "mine.json").write_text(content)
+    with pytest.raises(ValueError, match=r"the card .*mine\.json is damaged"):
+        curves({"mine": SimpleNamespace(path=tmp_path / "mine.safetensors")})

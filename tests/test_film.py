@@ -96,3 +96,9 @@ def test_a_run_that_goes_on_is_refused(run_folder, tmp_path):
             film(run_folder, tmp_path / "a.gif")
     finally:
         hidden.rename(model)
+
+
+def test_a_folder_that_is_not_there_is_told_before_filming(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main([str(tmp_path / "run"), "-o", str(tmp_path / "absent" / "a.gif")])
+    assert stopped.value.code == 2 and "there is no folder" in capsys.readouterr().err
