@@ -24,7 +24,7 @@ import re
 import runpy
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,13 +94,14 @@ class Method:
         head, equals, encoder = text.removesuffix(",frozen").partition("=")
         return cls(head, encoder if equals else None, frozen=text.endswith(",frozen"))
 
-    def hyperparameters(self, entry: dict[str, Any]) -> dict[str, Any]:
+    def hyperparameters(self, entry: dict[str, Any], given: Collection[str] = ()) -> dict[str, Any]:
         """What this method puts in place of a YAML entry's values; all else stays.
 
         :param entry: with ``policy_kwargs`` that read ``dict(...)``, as rl-zoo3 evaluates them, and name a shipped
             encoder ("Nav2D-v0/abisim")
+        :param given: names of hyperparameters that the user sets
         :return: ``policy_kwargs``, and for a frozen encoder ``policy`` and ``vec_env_wrapper``
-        :raises ValueError: when ``policy_kwargs`` have another form
+        :raises ValueError: when ``policy_kwargs`` have another form, or the method sets what is given
         """
         text = str(entry["policy_kwargs"])
         try:
@@ -121,7 +122,11 @@ class Method:
             values["features_extractor_class"] = f"get_class_by_name('sb3_abisim.extractors.{EXTRACTORS[self.name]}')"
             if self.name not in UNTRAINED:
                 values["features_extractor_kwargs"] = repr({"encoder": encoder})
-        return {"policy_kwargs": f"dict({', '.join(f'{name}={value}' for name, value in values.items())})", **others}
+        policy_kwargs = f"dict({', '.join(f'{name}={value}' for name, value in values.items())})"
+        replaced = {"policy_kwargs": policy_kwargs, **others}
+        for name in sorted(replaced.keys() & set(given)):
+            raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
+        return replaced
 
 
 def hyperparameters_file(algo: str, env_id: str) -> Path:
@@ -205,9 +210,7 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
             self.config = str(hyperparameters_file(self.algo, env_id))
         if method is not None:
             custom = self.custom_hyperparams or {}
-            replaced = method.hyperparameters(_entries(Path(self.config))[env_id])
-            for name in sorted(custom.keys() & replaced.keys()):
-                raise ValueError(f"-params {name} would undo --conf-file {method.name}; give one of the two")
+            replaced = method.hyperparameters(_entries(Path(self.config))[env_id], custom)
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = original(self)
         if encoding_kwargs(hyperparams) is not None and _normalizes_observations(hyperparams.get("normalize", False)):

@@ -159,6 +159,9 @@ def test_distractors_are_evaluated_on_three_splits() -> None:
         ({"params": ("sac.gamma:0.9",)}, "--params sac.gamma:0.9 is for sac, but here is only dqn, ppo"),
         ({"pretrain_params": ("curl.n_updates:3",)}, "curl.n_updates:3 is for curl, but here is only abisim, ssi"),
         ({"params": ("gamma",)}, "name:value, got 'gamma'"),
+        ({"params": ("dqn.learning_rat:1e-4",)}, "dqn has no hyperparameter 'learning_rat', only .*learning_rate"),
+        ({"params": ("ppo.seed:3",)}, "--params seed would not hold; give --seeds"),
+        ({"params": ("policy_kwargs:dict()",)}, "-params policy_kwargs would undo --conf-file"),
         ({"pretrain_params": ("n_update:3",)}, "unknown pretraining setting n_update"),
     ],
 )

@@ -8,11 +8,14 @@ and to nothing else. Changes of code without a change of version do not change t
 
 import dataclasses
 import hashlib
+import inspect
 import json
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+import stable_baselines3
 import yaml
 
 from sb3_abisim._version import __version__
@@ -24,6 +27,12 @@ from sb3_abisim.pretrain_config import load_config
 from sb3_abisim.zoo import DISTRACTOR_IDS, UNTRAINED, Method, hyperparameters_file
 
 ALGOS = ("ppo", "dqn", "sac")
+# What rl-zoo3 reads besides the algorithm's own arguments, and what has a flag of its own.
+ZOO_PARAMS = {
+    "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "noise_std", "noise_type",
+    "normalize", "vec_env_wrapper",
+}  # fmt: skip
+FLAGS = {"device": "--device", "n_timesteps": "--n-timesteps", "seed": "--seeds"}
 # The paper's Table of data: random-action transitions for pretraining.
 PAPER_N_TRANSITIONS = {"Nav2D": 1_000_000, "PointMaze": 250_000, "ScanNav": 100_000}
 # A random agent that may stop does so after four steps.
@@ -217,6 +226,9 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
     algo = plan.algo or ("dqn" if env_id.startswith("Nav2D") else "ppo")
     words = _params_of(plan.params, algo, ALGOS)
     entry = yaml.safe_load(hyperparameters_file(algo, env_id).read_text(encoding="utf-8"))[env_id]
+    given = dict(_name_and_value(word) for word in words)
+    _check_params(algo, given)
+    method.hyperparameters(entry, given)
     n = plan.n_timesteps or int(entry["n_timesteps"])
     eval_freq = plan.eval_freq or min(PAPER_EVAL_FREQ, max(n // 100, 1))
     inputs: tuple[Cell, ...] = ()
@@ -232,7 +244,7 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
         inputs = (encoder_cell(plan, env_id, method.name, encoder_seed),)
         conf_file += f"={inputs[0].output}"
     settings |= {
-        "hyperparams": {**entry, "n_timesteps": n, **dict(_name_and_value(word) for word in words)},
+        "hyperparams": {**entry, "n_timesteps": n, **given},
         "eval_freq": eval_freq, "eval_episodes": plan.eval_episodes, "n_eval_envs": plan.n_eval_envs,
     }  # fmt: skip
     frozen = ",frozen" if method.frozen else ""
@@ -248,6 +260,17 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
     output = f"{family}/{algo}/{env_id}_{int(key[:10], 16)}"
     title = f"{algo} {method.name}{frozen} {env_id} seed {seed}"
     return Cell("run", title, settings, inputs, tuple(command), output, f"{env_id}.zip", n)
+
+
+def _check_params(algo: str, names: Collection[str]) -> None:
+    """Refuse now what the zoo would refuse when the run begins, after all of pretraining."""
+    own = set(inspect.signature(getattr(stable_baselines3, algo.upper())).parameters)
+    known = (own | ZOO_PARAMS) - {*FLAGS, "env", "tensorboard_log", "verbose", "_init_setup_model"}
+    for name in names:
+        if name in FLAGS:
+            raise ValueError(f"--params {name} would not hold; give {FLAGS[name]}")
+        if name not in known:
+            raise ValueError(f"{algo} has no hyperparameter {name!r}, only {', '.join(sorted(known))}")
 
 
 def run_labels(cells: list[Cell]) -> dict[str, str]:
