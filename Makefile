@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow format lint type check docs bench figures benchmark benchmark-smoke clean
+.PHONY: help setup demo test test-slow format lint type check docs bench figures comparisons benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -54,6 +54,15 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 
 figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about a quarter of an hour
 	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results
+
+# The folders of committed runs whose curves stand in docs/results.md.
+COMPARISONS := distractor_frozen distractor_finetuned_methods nav2d_dqn
+
+comparisons: setup  ## draw every curve of docs/results.md anew from the committed runs; a minute
+	@for name in $(COMPARISONS); do \
+		$(BIN)/python -m sb3_abisim.benchmark report benchmarks/results/comparison/$$name -o build/comparisons/$$name && \
+		cp build/comparisons/$$name/curves.png docs/images/comparison-$$name.png || exit 1; \
+	done
 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
 	$(BIN)/python -m sb3_abisim.benchmark -o benchmark
