@@ -8,6 +8,7 @@ same machine type, package versions, device type and thread count).
 """
 
 import argparse
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -69,7 +70,10 @@ def pretrain(
     dataset = TransitionDataset(data, holdout=config.holdout)
     if objective == "abisim" and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
-        pretrain("ssi", data, base, seed=seed, device=device, progress_bar=progress_bar, verbose=verbose)
+        # Of the same network, whatever this one is asked to have.
+        base_config = load_config("ssi", env_id)
+        base_config = dataclasses.replace(base_config, network=config.network, network_kwargs=config.network_kwargs)
+        pretrain("ssi", data, base, base_config, None, seed, device, progress_bar, verbose)
     if objective != "abisim" and base is not None:
         raise ValueError(f"a base encoder belongs to 'abisim' alone, got base={base!r} for {objective!r}")
     folder = output.with_suffix(".run")

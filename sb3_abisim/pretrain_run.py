@@ -53,6 +53,9 @@ class PretrainRun:
         objective_kwargs = dict(config.objective_kwargs)
         objective_class = OBJECTIVES[objective]
         objective_class.check_k(config.k)
+        for name in sorted({"k", "encoder", "action_space", "base_encoder"} & objective_kwargs.keys()):
+            remedy = f"set k itself: k:{objective_kwargs['k']}" if name == "k" else "it follows from the other settings"
+            raise ValueError(f"objective_kwargs.{name} cannot be set; {remedy}")
         if objective_class.reads_action_sequences:
             objective_kwargs["k"] = config.k
         self.settings: dict[str, Any] = {

@@ -3,9 +3,9 @@
 import warnings
 
 import pytest
+from pretrain_inputs import collect_grids
 
 from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.collect import collect
 from sb3_abisim.dataset import TransitionDataset
 from sb3_abisim.pretrain import pretrain
 from sb3_abisim.pretrain_config import load_config
@@ -17,9 +17,7 @@ SETTINGS = {"n_updates": 10, "batch_size": 32, "log_interval": 5, "checkpoint_in
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("data") / "nav2d"
-    collect("Nav2D-v0", 2000, folder, n_envs=8)
-    return folder
+    return collect_grids(tmp_path_factory)
 
 
 def run(data, output, **settings):

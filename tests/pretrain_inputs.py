@@ -1,0 +1,18 @@
+"""What the tests of pretraining share: a small dataset, and runs of seconds."""
+
+from sb3_abisim.collect import collect
+from sb3_abisim.pretrain import pretrain
+from sb3_abisim.pretrain_config import load_config
+
+SETTINGS = {"n_updates": 30, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5}
+
+
+def collect_grids(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "nav2d"
+    collect("Nav2D-v0", 2000, folder, n_envs=8)
+    return folder
+
+
+def run(data, output, objective="ssi", callback=None, **settings):
+    config = load_config(objective, "Nav2D-v0", {**SETTINGS, **settings})
+    return pretrain(objective, data, output, config, device="cpu", progress_bar=False, verbose=0, callback=callback)
