@@ -18,6 +18,7 @@ class EncoderCallback(BaseCallback):
 
     :param verbose: as in Stable-Baselines3
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
+    :raises ValueError: when training starts, if the model was trained on the embeddings of another encoder
     """
 
     def _on_training_start(self) -> None:
@@ -33,6 +34,13 @@ class EncoderCallback(BaseCallback):
             )
         encoding = unwrap_vec_wrapper(self.training_env, VecEncodeObservations)
         if encoding is not None:
+            # VecNormalize.load brings the space of the saved run, and Stable-Baselines3 compares the model's with that.
+            space = self.model.observation_space
+            if space != encoding.observation_space:
+                raise ValueError(
+                    f"the model was trained on {space}, but {encoding.source} makes {encoding.observation_space}; give "
+                    "the encoder file that it was trained on"
+                )
             print(
                 f"Encoder of the environment: {type(encoding).__name__}, source {encoding.source}, "
                 f"digest {encoding.encoder_file.digest}, {encoding.n_parameters} parameters, frozen"

@@ -22,7 +22,8 @@ def fuse(model: AlgorithmT, encoder: str) -> AlgorithmT:
     The result has the same heads on a frozen features extractor, as if it had been trained through the pixels; it acts
     the same and can be trained further. Saved, it is complete: it loads where the encoder file is absent.
 
-    :param model: of any pixel algorithm, trained on ``VecEncodeObservations``; it is left as it was
+    :param model: of any pixel algorithm, trained on ``VecEncodeObservations``; it is left as it was. A loaded one
+        does not know whether its environment normalised observations: only a model that has it is refused for that
     :param encoder: the encoder file that it was trained on, as for ``VecEncodeObservations``
     :return: a model of the same class without an environment, on the same device
     :raises FileNotFoundError: if there is no such encoder

@@ -198,7 +198,9 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
                     f"--conf-file {self.config} needs hyperparameters of ours, which {env_id} has not; "
                     "write a YAML file for it, as docs/zoo.md shows"
                 )
-            return original(self)  # type: ignore[no-any-return]
+            hyperparams, saved_hyperparams = original(self)
+            _check_embeddings(hyperparams)
+            return hyperparams, saved_hyperparams
         if self.trial_id is not None:
             raise ValueError(
                 "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
@@ -213,11 +215,9 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
             replaced = method.hyperparameters(_entries(Path(self.config))[env_id], custom)
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = original(self)
-        if encoding_kwargs(hyperparams) is not None and _normalizes_observations(hyperparams.get("normalize", False)):
-            raise ValueError(
-                f"normalize={hyperparams['normalize']!r} would change the embeddings of the frozen encoder; give "
-                '"dict(norm_obs=False, norm_reward=True)"'
-            )
+        _check_embeddings(hyperparams)
+        if self.continue_training:
+            _check_continued(Path(self.trained_agent), env_id, self.algo, saved_hyperparams)
         if hyperparams.get("n_envs", 1) > 1 and "env_wrapper" not in hyperparams:
             self.vec_env_class = _in_lockstep(self.vec_env_class)
         # Hyperparameters are selected on the training clips, so that evaluation clips stay unseen.
@@ -229,6 +229,25 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
         return hyperparams, saved_hyperparams
 
     return read_hyperparameters
+
+
+def _check_embeddings(hyperparams: dict[str, Any]) -> None:
+    if encoding_kwargs(hyperparams) is not None and _normalizes_observations(hyperparams.get("normalize", False)):
+        raise ValueError(
+            f"normalize={hyperparams['normalize']!r} would change the embeddings of the frozen encoder; give "
+            '"dict(norm_obs=False, norm_reward=True)"'
+        )
+
+
+def _check_continued(agent: Path, env_id: str, algo: str, hyperparams: dict[str, Any]) -> None:
+    """Refuse ``-i`` with another method: rl-zoo3 keeps the model's policy, and would record the other method."""
+    runs = importlib.import_module("sb3_abisim.benchmark.runs")
+    config = agent.parent / env_id / "config.yml"
+    if not config.is_file():
+        return
+    there, here = (runs.method_label(values, algo) for values in (runs.read_yaml(config), hyperparams))
+    if there != here:
+        raise ValueError(f"{agent} was trained with {there}, not {here}; give the same --conf-file, as {config} has it")
 
 
 def _normalizes_observations(normalize: Any) -> bool:

@@ -12,11 +12,13 @@ from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_abisim.callbacks import EncoderCallback
 from sb3_abisim.checkpoint import save_encoder
 from sb3_abisim.extractors import ActionBisimExtractor, VanillaExtractor, find_extractors
 from sb3_abisim.networks import make_encoder
+from sb3_abisim.vec_env import VecEncodeObservations
 
 
 class Grid(gym.Env):
@@ -48,21 +50,22 @@ class Recorder(Logger):
             self.values.append(value)
 
 
+SAVED: dict[str, Any] = {
+    "observation_space": Grid.observation_space,
+    "action_space": spaces.Discrete(4),
+    "env_id": "Nav2D-v0",
+    "env_kwargs": {},
+    "objective": "abisim",
+    "settings": {},
+    "dataset_digest": "0" * 64,
+    "golden_observations": np.zeros((1, 3, 15, 15), np.uint8) + 9,
+}
+
+
 @pytest.fixture
 def encoder(tmp_path: Path) -> tuple[str, str]:
     path = tmp_path / "mine.safetensors"
-    digest = save_encoder(
-        path,
-        make_encoder(Grid.observation_space),
-        observation_space=Grid.observation_space,
-        action_space=spaces.Discrete(4),
-        env_id="Nav2D-v0",
-        env_kwargs={},
-        objective="abisim",
-        settings={},
-        dataset_digest="0" * 64,
-        golden_observations=np.zeros((1, 3, 15, 15), np.uint8) + 9,
-    )
+    digest = save_encoder(path, make_encoder(Grid.observation_space), **SAVED)
     return str(path), digest
 
 
@@ -110,6 +113,31 @@ def test_missing_weights_stop_training_before_the_first_step() -> None:
     with pytest.raises(FileNotFoundError, match=r"no/such\.safetensors"):
         learn(model, 10)
     assert model.num_timesteps == 0
+
+
+def test_a_model_of_another_encoders_embeddings_does_not_go_on(encoder: tuple[str, str], tmp_path: Path) -> None:
+    def environment(file: str) -> VecNormalize:
+        return VecNormalize(VecEncodeObservations(DummyVecEnv([Grid]), file, device="cpu"), norm_obs=False)
+
+    other = str(Path(encoder[0]).with_name("other.safetensors"))
+    th.manual_seed(1)
+    save_encoder(
+        Path(other),
+        make_encoder(Grid.observation_space),
+        **{**SAVED, "objective": "ssi"},
+    )
+    env = environment(encoder[0])
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu")
+    learn(model, 8)
+    model.save(tmp_path / "model.zip"), env.save(str(tmp_path / "vecnormalize.pkl"))
+    for file in (encoder[0], other):
+        loaded = VecNormalize.load(str(tmp_path / "vecnormalize.pkl"), environment(file).venv)
+        again = PPO.load(tmp_path / "model.zip", env=loaded, device="cpu")
+        if file == encoder[0]:
+            learn(again, 8)
+        else:
+            with pytest.raises(ValueError, match=r"other\.safetensors makes .*give the encoder file"):
+                learn(again, 8)
 
 
 def test_untrained_network(capsys: pytest.CaptureFixture[str]) -> None:

@@ -234,6 +234,28 @@ def test_mistakes_are_refused(manager: Any) -> None:
         manager("ppo", "CartPole-v1", "abisim=mine.safetensors").read_hyperparameters()
 
 
+def test_a_run_goes_on_with_its_own_method_or_not_at_all(manager: Any, tmp_path: Path) -> None:
+    first = manager("ppo", "Nav2D-v0", "ssi")
+    first.params_path = str(tmp_path / "Nav2D-v0")
+    Path(first.params_path).mkdir()
+    first.args = argparse.Namespace()
+    first._save_config(first.read_hyperparameters()[1])
+    (tmp_path / "Nav2D-v0.zip").touch()
+    agent = str(tmp_path / "Nav2D-v0.zip")
+    manager("ppo", "Nav2D-v0", "ssi", trained_agent=agent).read_hyperparameters()
+    for config, here in ((None, "abisim"), ("ssi,frozen", "ssi,frozen"), ("acro", "acro")):
+        with pytest.raises(ValueError, match=f"was trained with ssi, not {here}; give the same --conf-file"):
+            manager("ppo", "Nav2D-v0", config, trained_agent=agent).read_hyperparameters()
+
+
+def test_an_own_environment_with_normalised_embeddings_is_refused(manager: Any, tmp_path: Path) -> None:
+    wrapper = f"[{{{zoo.ENCODING_WRAPPER}: {{encoder: x}}}}]"
+    text = f"CartPole-v1: {{policy: MlpPolicy, n_timesteps: 7, normalize: true, vec_env_wrapper: {wrapper}}}\n"
+    (tmp_path / "own.yml").write_text(text)
+    with pytest.raises(ValueError, match="would change the embeddings of the frozen encoder"):
+        manager("ppo", "CartPole-v1", str(tmp_path / "own.yml")).read_hyperparameters()
+
+
 def test_installing_again_changes_nothing() -> None:
     cls = exp_manager.ExperimentManager
     before = dict(vars(cls))

@@ -132,7 +132,7 @@ def read_run(folder: str | Path) -> Run:
     found = list(folder.glob("*/args.yml"))
     if len(found) != 1:
         raise ValueError(f"{folder} is no run folder of rl-zoo3 (no <Env>/args.yml in it)")
-    args, config = _read_yaml(found[0]), _read_yaml(found[0].with_name("config.yml"))
+    args, config = read_yaml(found[0]), read_yaml(found[0].with_name("config.yml"))
     try:
         n_timesteps = int(args["n_timesteps"] if args["n_timesteps"] > 0 else config["n_timesteps"])
         command = found[0].with_name("command.txt")
@@ -143,7 +143,7 @@ def read_run(folder: str | Path) -> Run:
         names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
         return Run(
             folder=folder,
-            label=_label(config, str(args["algo"])),
+            label=method_label(config, str(args["algo"])),
             env_id=args["env"],
             algo=args["algo"],
             seed=int(args["seed"]),
@@ -195,14 +195,24 @@ def is_deterministic(env_id: str) -> bool | None:
     return not (ExperimentManager.is_atari(env_id) or ExperimentManager.is_minigrid(env_id))
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file of rl-zoo3 as data; its Python objects become names.
+
+    :param path: ``args.yml`` or ``config.yml``
+    :raises ValueError: if it cannot be read
+    """
     try:
         return dict(yaml.load(path.read_text(encoding="utf-8"), _Loader))
     except (OSError, yaml.YAMLError, TypeError) as error:
         raise ValueError(f"cannot read {path} ({error}); was it written by rl_zoo3.train?") from error
 
 
-def _label(config: dict[str, Any], algo: str) -> str:
+def method_label(config: dict[str, Any], algo: str) -> str:
+    """What a run is called: its method, such as "abisim,frozen", or the algorithm without an extractor of ours.
+
+    :param config: hyperparameters as in the zoo's ``config.yml``
+    :param algo: rl-zoo3's name
+    """
     encoding = encoding_kwargs(config)
     if encoding is not None:
         return f"{encoding.get('objective') or algo},frozen"
