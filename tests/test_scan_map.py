@@ -78,6 +78,19 @@ def test_vertex_colours_are_interpolated(tmp_path):
     assert np.abs(scan.orthophoto[at(scan, x, y)] - expected).max() <= 2
 
 
+def test_a_material_without_a_texture_shows_its_vertex_colours(tmp_path):
+    plain, coloured = floor(False), floor(False)
+    colours = plain.visual.vertex_colors.copy()
+    material = trimesh.visual.material.PBRMaterial(name="as Blender writes it")
+    coloured.visual = trimesh.visual.TextureVisuals(uv=np.zeros((4, 2)), material=material)
+    coloured.visual.vertex_attributes["color"] = colours
+    there, here = (
+        ScanMap.from_mesh(write(trimesh.Scene([mesh]), tmp_path / f"{name}.glb"))
+        for name, mesh in (("plain", plain), ("coloured", coloured))
+    )
+    assert there.orthophoto.std() > 20 and np.array_equal(there.orthophoto, here.orthophoto)
+
+
 @pytest.mark.parametrize("turn", [y_up, lambda scene: scene])
 def test_the_upward_axis_is_found(tmp_path, turn, scan):
     path = write(turn(house()), tmp_path / "scan.glb")
@@ -282,6 +295,36 @@ def test_a_missing_texture_is_one_warning_and_grey(tmp_path):
         scan = ScanMap.from_mesh(path)
     assert len(warned) == 1
     assert scan.orthophoto[at(scan, 3.5, 3.5)].tolist() == [160, 160, 160]
+    with pytest.warns(UserWarning, match=r"scan.obj refers to \S+\.png, which is not there"):
+        ScanMap.from_mesh(path)  # from the cache
+
+
+@pytest.mark.parametrize("line", ["/home/me/scans/{}", "..\\{}", "textures/{}", "my%20{}", "a%20b/{}"])
+def test_textures_under_another_machines_path(tmp_path, line, scan):
+    path = write(trimesh.Scene([floor()]), tmp_path / "scan.obj")
+    (material,) = tmp_path.glob("*.mtl")
+    (picture,) = tmp_path.glob("*.png")
+    name = f"my {picture.name}" if line.startswith("my") else picture.name
+    name = f"a b/{name}" if line.startswith("a%20b") else name
+    (tmp_path / "a b").mkdir()
+    picture.rename(tmp_path / name)
+    material.write_text(material.read_text().replace(picture.name, line.format(picture.name)))
+    textured = ScanMap.from_mesh(path)
+    assert textured.orthophoto[at(textured, 0.2, 3.8)].tolist() == [30, 200, 30]
+    # The cache knows the file that was read.
+    Image.new("RGB", (64, 64), (1, 2, 3)).save(tmp_path / name)
+    assert ScanMap.from_mesh(path).orthophoto[at(textured, 0.2, 3.8)].tolist() == [1, 2, 3]
+
+
+def test_nothing_outside_of_the_scans_folder_is_read(tmp_path):
+    (tmp_path / "scan").mkdir()
+    path = write(trimesh.Scene([floor()]), tmp_path / "scan" / "scan.obj")
+    (material,) = path.parent.glob("*.mtl")
+    (picture,) = path.parent.glob("*.png")
+    picture.rename(tmp_path / picture.name)
+    material.write_text(material.read_text().replace(picture.name, f"../{picture.name}"))
+    with pytest.warns(UserWarning, match=r"which is not there \(in the scan's folder\)"):
+        ScanMap.from_mesh(path)
 
 
 @pytest.mark.parametrize(

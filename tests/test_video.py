@@ -249,6 +249,20 @@ class TestSplit:
             (folder / name).touch()
         assert [source.name for source in find_sources(folder)] == ["a.mp4", "c/0.mp4"]
 
+    def test_a_division_is_known_whatever_its_spelling(self, folder):
+        for name in ("Training/a.mp4", "VAL/a.mp4", "VAL/b.mp4"):
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).touch()
+        sides = {source.name: source.split for source in find_sources(folder)}
+        assert sides == {"Training/a.mp4": "train", "VAL/a.mp4": "eval", "VAL/b.mp4": "eval"}
+
+    def test_frames_beside_a_film_are_not_dropped(self, folder):
+        for i in range(5):
+            (folder / f"{i}.png").touch()
+        (folder / "preview.mp4").touch()
+        with pytest.raises(ValueError, match=r"holds 5 pictures beside preview\.mp4"):
+            find_sources(folder)
+
     def test_one_group_leaves_a_side_empty(self, folder):
         write_video(folder / "film" / "1.mp4"), write_video(folder / "film" / "2.mp4", 1)
         with pytest.raises(ValueError, match=r"2 clips.*one group, 'film'.*add another video"):

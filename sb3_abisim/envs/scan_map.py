@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.atomic import file_digest, write_atomic
-from sb3_abisim.envs.scan_mesh import LEVEL_BIN, ScanMesh, SceneError, level_areas, load_mesh
+from sb3_abisim.envs.scan_mesh import LEVEL_BIN, ScanMesh, SceneError, level_areas, load_mesh, warn_missing
 from sb3_abisim.envs.scan_raster import Nearest, contour_pixels, fragments, shade
 
 FORMAT = "sb3_abisim scan map 1"
@@ -35,7 +35,7 @@ SLICE_DISTANCE = 0.1  # m
 # Pinholes of a scan's floor up to this wide do not stop anyone.
 PINHOLE = 0.06  # m
 # Part of the cache's keys: raise it where the same mesh gives another map.
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -245,6 +245,7 @@ def _cached(key: list[Any], settings: MapSettings, make: Callable[[], ScanMap], 
     except SceneError:
         kept = None  # absent, or damaged: made anew
     if kept is not None and all(_digest(folder / name) == sha for name, sha in kept.settings["files"].items()):
+        warn_missing(kept.source, (name for name, sha in kept.settings["files"].items() if not sha))
         return kept
     made = make()
     try:

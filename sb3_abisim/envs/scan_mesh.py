@@ -6,11 +6,14 @@ A :class:`ScanMesh` is z-up, in metres. Files are read by trimesh (``pip install
 import io
 import json
 import os
+import re
 import struct
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,15 +166,18 @@ def _read(path: Path) -> tuple[list[_Part], dict[str, str]]:
 
     class Recorder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc, unused-ignore]
         def get(self, name: str) -> bytes:
-            try:
-                data: bytes = super().get(name)
-            except (OSError, ValueError):
-                files[name] = ""
-                missing.append(name)
-                raise
-            file = self.absolute(name)
-            files[name] = file_digest(file) if file.is_file() else ""
-            return data
+            # glTF writes a space as %20. Exporters write paths of their own machine: then the file beside the scan.
+            # Nothing outside of the scan's folder is read.
+            folder = path.parent.resolve()
+            beside = re.split(r"[/\\]", unquote(name.strip()))[-1]
+            for candidate in (name.strip(), unquote(name.strip()), beside):
+                file = folder / candidate
+                if file.resolve().is_relative_to(folder) and file.is_file():
+                    files[candidate] = file_digest(file)
+                    return file.read_bytes()
+            files[beside] = ""
+            missing.append(name)
+            raise FileNotFoundError(name)
 
     try:
         with warnings.catch_warnings():
@@ -184,15 +190,25 @@ def _read(path: Path) -> tuple[list[_Part], dict[str, str]]:
     except Exception as error:  # what trimesh raises for a damaged file depends on where the damage is
         lost = f"; it refers to {missing[0]}, which is not there" if missing else ""
         raise SceneError(f"{path} cannot be read ({type(error).__name__}: {error}){lost}; export it again") from error
-    if missing:
-        warnings.warn(
-            f"{path} refers to {', '.join(sorted(set(missing)))}, which is not there; its surfaces get a flat colour",
-            stacklevel=4,
-        )
+    warn_missing(path, missing)
     if not parts:
         kind = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
         raise SceneError(f"{path} is {kind}: it has no faces; export the scan as a mesh of triangles")
     return parts, files
+
+
+def warn_missing(source: str | os.PathLike[str], names: Iterable[str]) -> None:
+    """Say which files of a scan are not there, if any.
+
+    :param source: the scan
+    :param names: of the files that it refers to
+    """
+    if missing := sorted(set(names)):
+        warnings.warn(
+            f"{source} refers to {', '.join(missing)}, which is not there (in the scan's folder); its surfaces get a "
+            "flat colour",
+            stacklevel=4,
+        )
 
 
 def _parts(scene: Any, trimesh: Any, missing: list[str]) -> list[_Part]:
@@ -219,6 +235,12 @@ def _surface(visual: Any, faces: NDArray[np.int64], missing: list[str]) -> Surfa
             texture = np.rint(pixels).astype(np.uint8)
             return Surface(len(faces), texture, np.asarray(visual.uv, dtype=np.float32)[faces])
         # An untextured material has its own colour, unless it has lost its texture.
+        # glTF multiplies it by the vertices' colours.
+        colours = visual.vertex_attributes.get("color")
+        if colours is not None and not missing:
+            largest = np.iinfo(colours.dtype).max if colours.dtype.kind == "u" else 1.0
+            shown = np.asarray(colours, dtype=np.float32)[:, :3] / np.float32(largest) * factor
+            return Surface(len(faces), None, shown[faces])
         flat = np.array(MISSING_COLOUR if missing else factor, dtype=np.float32)
         return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
     if visual.kind == "vertex":

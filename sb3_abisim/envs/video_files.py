@@ -16,8 +16,11 @@ VIDEO_SUFFIXES = (".avi", ".gif", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".webp")
 # yt-dlp writes "title [id].mp4", Kinetics "id_000010_000020.mp4".
 _YOUTUBE_ID = re.compile(r"\[([\w-]{11})\]|^([\w-]{11})_\d{6}_\d{6}$")
-# Beside a folder "train".
-UNSEEN_FOLDERS = ("eval", "val", "valid", "validation", "test")
+# A division that the folder brings along, whatever the case of letters.
+TRAIN_FOLDERS = ("train", "training")
+UNSEEN_FOLDERS = ("eval", "evaluation", "val", "valid", "validation", "test", "testing")
+# Of each film beside them; more are frames.
+MAX_THUMBNAILS = 4
 _DAVIS_LISTS = {"train": "train.txt", "eval": "val.txt"}
 
 
@@ -58,12 +61,12 @@ def natural_key(name: str) -> list[Any]:
 def find_sources(root: Path) -> tuple[Source, ...]:
     """All clips in a folder, sorted by name.
 
-    ``root/train`` and ``root/eval`` (or :data:`UNSEEN_FOLDERS`), where both exist, are taken as the split. Links to
-    folders are followed. Hidden files are left out, and so are
-    pictures beside video files (their thumbnails).
+    ``root/train`` and ``root/eval`` (:data:`TRAIN_FOLDERS` and :data:`UNSEEN_FOLDERS`), where both exist, are taken as
+    the split. Links to folders are followed. Hidden files are left out, and so are pictures beside video files (their
+    thumbnails).
 
     :param root: the folder
-    :raises ValueError: for a folder that is missing, not a folder, or without videos
+    :raises ValueError: for a folder that is missing, not a folder, without videos, or with frames beside video files
     """
     if not root.exists():
         raise ValueError(f"the folder of videos {root} does not exist (from {Path.cwd()}); correct the path")
@@ -71,9 +74,12 @@ def find_sources(root: Path) -> tuple[Source, ...]:
         raise ValueError(f"{root} is a file; give the folder with your videos, at least two, one for each of {SPLITS}")
     if (root / "JPEGImages" / "480p").is_dir():
         return _find_davis(root)
-    unseen = [root / name for name in UNSEEN_FOLDERS if (root / name).is_dir()]
-    if (root / "train").is_dir() and unseen:
-        sources = _find(root / "train", "train") + [source for folder in unseen for source in _find(folder, "eval")]
+    sides = {
+        side: [folder for folder in sorted(root.iterdir()) if folder.name.lower() in names and folder.is_dir()]
+        for side, names in (("train", TRAIN_FOLDERS), ("eval", UNSEEN_FOLDERS))
+    }
+    if sides["train"] and sides["eval"]:
+        sources = [source for side, folders in sides.items() for folder in folders for source in _find(folder, side)]
     else:
         sources = _find(root, None)
     if not sources:
@@ -101,6 +107,11 @@ def _find(root: Path, split: str | None) -> list[Source]:
         videos = [here / name for name in visible if name.lower().endswith(VIDEO_SUFFIXES)]
         images = [here / name for name in visible if name.lower().endswith(IMAGE_SUFFIXES)]
         clips = [(video, [video]) for video in videos]
+        if videos and len(images) > MAX_THUMBNAILS * len(videos):
+            raise ValueError(
+                f"{here} holds {len(images)} pictures beside {videos[0].name}: frames or thumbnails? Move the pictures "
+                "or the video, to a folder of their own"
+            )
         if images and not videos:
             clips.append((here, images))
         for path, files in clips:
