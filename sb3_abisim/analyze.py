@@ -21,6 +21,8 @@ from sb3_abisim.atomic import write_atomic
 from sb3_abisim.checkpoint import EncoderFile, load_encoder
 
 SWEEP_LAYOUTS = 2
+# The committed encoders, where the command runs in a checkout.
+TRAINED = Path("benchmarks/encoders")
 ENCODERS_HELP = {
     False: "files or names (default: all that ship for the environment)",
     True: "files or names (default: all that ship for the environment, and those in TRAINED/<env id>)",
@@ -83,7 +85,7 @@ def figure(args: argparse.Namespace) -> None:
     one = FIGURES[args.command]
     files = {}
     if one.encoders:
-        trained = args.trained if one.trained else None
+        trained = (args.trained or TRAINED) if one.trained else None
         files = load_all(args.encoders or default_encoders(args.env, trained), args.env)
     path = make_figure(args.command, files, args.env, args.n, args.images, args.numbers or args.images)
     if args.command == "probes":
@@ -102,7 +104,7 @@ def all_figures(args: argparse.Namespace) -> None:
     folders = ["--images", str(args.images), "--numbers", str(args.numbers or args.images)]
     for words in commands:
         print(f"$ python -m sb3_abisim.analyze {' '.join(words)}", flush=True)
-        main([*words, *folders, "--trained", str(args.trained)])
+        main([*words, *folders, *(["--trained", str(args.trained)] if args.trained else [])])
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -140,8 +142,8 @@ def _add_folders(command: argparse.ArgumentParser) -> None:
     command.add_argument("--images", type=Path, default="figures", metavar="DIR", help="PNGs (default: %(default)s)")
     command.add_argument("--numbers", type=Path, metavar="DIR", help="JSON (default: the folder of the PNGs)")
     command.add_argument(
-        "--trained", type=Path, metavar="TRAINED", default="benchmarks/encoders",
-        help="encoders trained for figures: <env id>/*.safetensors, and c_sweep (default: %(default)s)",
+        "--trained", type=Path, metavar="TRAINED",
+        help=f"encoders trained for figures: <env id>/*.safetensors, and c_sweep (default: {TRAINED}, if it is there)",
     )  # fmt: skip
 
 
@@ -153,13 +155,15 @@ def main(argv: list[str] | None = None) -> None:
     parser = _parser()
     args = parser.parse_args(argv)
     try:
+        if getattr(args, "trained", None) and not args.trained.is_dir():
+            raise ValueError(f"there is no folder --trained {args.trained}; it holds <env id>/*.safetensors")
         if args.command == "exact":
             _exact_command(args)
         elif args.command == "all":
             all_figures(args)
         elif args.command == "sweep":
             folders = (args.images, args.numbers or args.images)
-            print(make_sweep(args.c, args.base, args.trained / "c_sweep", args.data, args.n, *folders))
+            print(make_sweep(args.c, args.base, (args.trained or TRAINED) / "c_sweep", args.data, args.n, *folders))
         else:
             figure(args)
     except (ValueError, FileNotFoundError) as error:

@@ -62,7 +62,7 @@ def film(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: in
                 observation, _, terminated, truncated, info = env.step(action)
                 seen.append(_picture(env.render()))
                 over = terminated or truncated
-            successes += bool(info["is_success"])
+            successes += bool(info.get("is_success", False))
             pictures += seen[:: -(-len(seen) // MAX_PICTURES)] + [seen[-1]] * (N_LAST - 1)
     finally:
         env.close()

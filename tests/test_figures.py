@@ -47,6 +47,12 @@ def test_every_figure(name, tmp_path, capsys):
             assert load_encoder(encoder).digest in json.dumps(results)
 
 
+def test_a_mistyped_folder_of_encoders_is_named(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        analyze.main(["curves", "--env", "Nav2D-v0", "--images", str(tmp_path), "--trained", str(tmp_path / "no")])
+    assert f"there is no folder --trained {tmp_path / 'no'}" in capsys.readouterr().err
+
+
 def test_sweep_over_given_encoders(tmp_path):
     (tmp_path / "c_sweep").mkdir()
     shutil.copy(resource_path("encoders") / "Nav2D-v0/abisim.safetensors", tmp_path / "c_sweep/abisim_c0.9.safetensors")

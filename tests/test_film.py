@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -53,6 +54,17 @@ def test_of_a_long_episode_some_pictures_are_left_out(run_folder, tmp_path, monk
     film(run_folder, tmp_path / "a.gif", n_episodes=1)
     # Every third of ten, the last among them.
     assert sum(duration for duration, _ in pictures(tmp_path / "a.gif")) == (4 + N_LAST - 1) * MILLISECONDS
+
+
+def test_an_environment_that_knows_no_success(run_folder, tmp_path, monkeypatch):
+    class Silent(gym.Wrapper):
+        def step(self, action):
+            return (*super().step(action)[:4], {})
+
+    plain = gym.make
+    monkeypatch.setattr(gym, "make", lambda *args, **kwargs: Silent(plain(*args, **kwargs)))
+    assert film(run_folder, tmp_path / "a.gif", n_episodes=1) == 0.0
+    assert (tmp_path / "a.gif").is_file()
 
 
 def test_the_same_seed_films_the_same(run_folder, tmp_path):
