@@ -279,7 +279,12 @@ def _parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
     return result
 
 
-def _import_packages(names: list[str]) -> None:
+def import_packages(names: list[str]) -> None:
+    """Import modules that register environments.
+
+    :param names: of the modules
+    :raises ValueError: for one that cannot be imported
+    """
     for name in names:
         try:
             importlib.import_module(name)
@@ -310,7 +315,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="imported to register ids")
     args = parser.parse_args(argv)
     try:
-        _import_packages(args.gym_packages)
+        import_packages(args.gym_packages)
         env_kwargs = _parse_env_kwargs(args.env_kwargs)
         collect(args.env, args.n, args.o, seed=args.seed, n_envs=args.n_envs, env_kwargs=env_kwargs, progress=True)
     except (ValueError, ImportError) as error:

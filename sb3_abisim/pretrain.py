@@ -57,7 +57,8 @@ def pretrain(
     from sb3_abisim.allocator import keep_freed_memory
     from sb3_abisim.atomic import folder_lock
     from sb3_abisim.dataset import TransitionDataset
-    from sb3_abisim.pretrain_run import PretrainRun
+    from sb3_abisim.networks import make_encoder
+    from sb3_abisim.pretrain_run import PretrainRun, make_objective
 
     if objective not in OBJECTIVE_NAMES:
         raise ValueError(f"unknown objective {objective!r}; known are {', '.join(OBJECTIVE_NAMES)}")
@@ -70,6 +71,9 @@ def pretrain(
     dataset = TransitionDataset(data, holdout=config.holdout)
     if objective == "abisim" and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
+        # Mistakes in its own settings are found before the base is trained.
+        stand_in = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
+        make_objective(objective, dataset, config, stand_in)
         # Of the same network, whatever this one is asked to have.
         base_config = load_config("ssi", env_id)
         base_config = dataclasses.replace(base_config, network=config.network, network_kwargs=config.network_kwargs)

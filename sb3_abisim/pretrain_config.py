@@ -24,7 +24,7 @@ class PretrainConfig:
         objectives that embed both observations have fewer to embed (docs/pretraining.md)
     :param holdout: share of the episodes that is only evaluated on, 0 <= holdout < 1
     :param log_interval: updates between two rows of the log
-    :param checkpoint_interval: updates between two checkpoints
+    :param checkpoint_interval: least updates between two checkpoints, each written at a row of the log
     :param network: name of the encoder network, None for the default of the observation's shape
     :param network_kwargs: its constructor arguments
     :param objective_kwargs: constructor arguments of the objective

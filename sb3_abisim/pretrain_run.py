@@ -32,6 +32,34 @@ N_STANDARDIZE = 4096
 N_HOLDOUT_BATCHES = 8
 
 
+def make_objective(
+    objective: str, dataset: TransitionDataset, config: PretrainConfig, base_encoder: Encoder | None = None
+) -> Objective:
+    """An objective with a fresh encoder, on the CPU.
+
+    :param objective: a key of ``OBJECTIVES``
+    :param dataset: whose spaces it is for
+    :param config: the settings
+    :param base_encoder: of action-bisimulation
+    :raises ValueError: for settings that do not fit the objective or the dataset
+    """
+    objective_class = OBJECTIVES[objective]
+    objective_class.check_k(config.k)
+    kwargs = dict(config.objective_kwargs)
+    for name in sorted({"k", "encoder", "action_space", "base_encoder"} & kwargs.keys()):
+        remedy = f"set k itself: k:{kwargs['k']}" if name == "k" else "it follows from the other settings"
+        raise ValueError(f"objective_kwargs.{name} cannot be set; {remedy}")
+    if objective_class.reads_action_sequences:
+        kwargs["k"] = config.k
+    if base_encoder is not None:
+        kwargs["base_encoder"] = base_encoder
+    encoder = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
+    try:
+        return objective_class(encoder, dataset.action_space, **kwargs)
+    except TypeError as error:
+        raise ValueError(f"objective_kwargs do not fit {objective}: {error}") from error
+
+
 class PretrainRun:
     """One pretraining run: its parts, its position, and how both are saved."""
 
@@ -50,33 +78,22 @@ class PretrainRun:
         self.callback = callback
         self.folder = output.with_suffix(".run")
         self.device = get_device(device)
-        objective_kwargs = dict(config.objective_kwargs)
-        objective_class = OBJECTIVES[objective]
-        objective_class.check_k(config.k)
-        for name in sorted({"k", "encoder", "action_space", "base_encoder"} & objective_kwargs.keys()):
-            remedy = f"set k itself: k:{objective_kwargs['k']}" if name == "k" else "it follows from the other settings"
-            raise ValueError(f"objective_kwargs.{name} cannot be set; {remedy}")
-        if objective_class.reads_action_sequences:
-            objective_kwargs["k"] = config.k
         self.settings: dict[str, Any] = {
             "objective": objective,
             "seed": seed,
             "dataset_digest": dataset.digest,
             **config.as_settings(),
         }
+        base_encoder = None
         if base is not None:
             base_file = load_encoder(base)
             base_file.check(dataset.observation_space, dataset.action_space)
-            objective_kwargs["base_encoder"] = base_file.encoder
+            base_encoder = base_file.encoder
             self.settings["base_digest"] = base_file.digest
             self.settings["base_objective"] = base_file.contract["objective"]
         # Weights are drawn on the CPU, so that they do not depend on the device.
         th.manual_seed(seed)
-        encoder = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
-        try:
-            module = objective_class(encoder, dataset.action_space, **objective_kwargs)
-        except TypeError as error:
-            raise ValueError(f"objective_kwargs do not fit {objective}: {error}") from error
+        module = make_objective(objective, dataset, config, base_encoder)
         # As encoders lie in memory; decoders, too.
         self.module: Objective = module.to(self.device, memory_format=th.channels_last)  # type: ignore[call-overload]
         self._trained = [parameter for parameter in self.module.parameters() if parameter.requires_grad]

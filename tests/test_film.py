@@ -90,6 +90,7 @@ def test_the_seed_is_that_of_the_actions_too(run_folder, tmp_path, monkeypatch):
     [
         (["nowhere"], "nowhere is no run folder of rl-zoo3"),
         (["RUN", "--episodes", "0"], "n_episodes must be at least 1, got 0"),
+        (["RUN", "--gym-packages", "no_such_module"], "--gym-packages: cannot import 'no_such_module'"),
     ],
 )
 def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message):

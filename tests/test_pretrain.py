@@ -79,6 +79,12 @@ def test_a_base_made_on_the_way_has_the_network_asked_for(data, tmp_path, monkey
     assert base.encoder.features_dim == load_encoder(str(output)).encoder.features_dim == 18
 
 
+def test_mistakes_are_found_before_the_base_is_trained(data, tmp_path):
+    with pytest.raises(ValueError, match="objective_kwargs do not fit abisim"):
+        run(data, tmp_path / "abisim.safetensors", "abisim", **{"objective_kwargs.gama": 0.9})
+    assert not list(tmp_path.iterdir())
+
+
 def test_abisim_takes_every_base(data, tmp_path):
     for objective, k in (("acro", [1, 4]), ("info_nce", 2)):
         base = run(data, tmp_path / f"{objective}{k}.safetensors", objective, k=k)
