@@ -36,9 +36,9 @@ EMBED_BATCH = 2048
 
 _Y, _X = np.divmod(np.arange(N_CELLS), SIZE)
 _DY, _DX = _Y[None] - _Y[:, None], _X[None] - _X[:, None]
-# Indices [agent, cell] into a map of offsets, (2 SIZE - 1) squared, and the city-block distance.
+# By [agent, cell]: indices into a map of offsets, (2 SIZE - 1) squared, and the city-block distance.
 _OFFSET = (_DY + SIZE - 1) * (2 * SIZE - 1) + _DX + SIZE - 1
-_DISTANCE = np.abs(_DY) + np.abs(_DX)
+DISTANCE = np.abs(_DY) + np.abs(_DX)
 
 Maps = NDArray[np.float64]
 
@@ -124,6 +124,19 @@ def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> th.Tensor:
     return th.cat(parts)
 
 
+def states(base: Encoder, obstacles: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], th.Tensor]:
+    """All states of a layout.
+
+    :param base: the base encoder
+    :param obstacles: (SIZE * SIZE,)
+    :return: free cells (n,), where each move leads from them as indices into them (n, 4), and the base embedding with
+        the agent there (n, features_dim)
+    """
+    free = np.flatnonzero(~obstacles)
+    nexts = np.searchsorted(free, next_cells(obstacles)[free])
+    return free, nexts, embed(base, pictures(obstacles, free))
+
+
 def learned_maps(encoder: Encoder, layouts: NDArray[np.bool_]) -> Maps:
     """L1 distances of embeddings with one cell toggled.
 
@@ -152,9 +165,9 @@ def exact_maps(base: Encoder, layouts: NDArray[np.bool_], c: float) -> Maps:
     maps = np.full((len(layouts), N_CELLS, N_CELLS), np.nan)
     for k, obstacles in enumerate(layouts):
         agents = reachable(obstacles)
-        free, nexts, features = _states(base, obstacles)
+        free, nexts, features = states(base, obstacles)
         for cell in _togglable():
-            other_free, other_nexts, other_features = _states(base, _toggled(obstacles, cell))
+            other_free, other_nexts, other_features = states(base, _toggled(obstacles, cell))
             base_distance = th.cdist(features, other_features, p=1.0).numpy()
             metric = action_bisim_metric(base_distance, nexts, other_nexts, c, tol=TOLERANCE)
             stay = agents[agents != cell]
@@ -170,7 +183,7 @@ def exact_distances(base: Encoder, obstacles: NDArray[np.bool_], c: float) -> ND
     :param obstacles: (SIZE * SIZE,)
     :param c: weight of the recursive term
     """
-    free, nexts, features = _states(base, obstacles)
+    free, nexts, features = states(base, obstacles)
     rows = np.searchsorted(free, reachable(obstacles))
     base_distance = th.cdist(features, features, p=1.0).numpy()
     metric: NDArray[np.float32] = action_bisim_metric(base_distance, nexts, c=c, tol=TOLERANCE)[np.ix_(rows, rows)]
@@ -196,7 +209,7 @@ def profile(maps: Maps) -> NDArray[np.float64]:
 
     :param maps: (n_layouts, agent's cell, toggled cell)
     """
-    means = np.array([np.nanmean(maps[:, (low <= _DISTANCE) & (high >= _DISTANCE)]) for low, high in BINS])
+    means = np.array([np.nanmean(maps[:, (low <= DISTANCE) & (high >= DISTANCE)]) for low, high in BINS])
     relative: NDArray[np.float64] = means / means[0]
     return relative
 
@@ -272,10 +285,3 @@ def _toggled(obstacles: NDArray[np.bool_], cell: int) -> NDArray[np.bool_]:
     other = obstacles.copy()
     other[cell] ^= True
     return other
-
-
-def _states(base: Encoder, obstacles: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64], th.Tensor]:
-    """Free cells, where each move leads as indices into them, and the base embedding with the agent there."""
-    free = np.flatnonzero(~obstacles)
-    nexts = np.searchsorted(free, next_cells(obstacles)[free])
-    return free, nexts, embed(base, pictures(obstacles, free))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import (
     BINS,
+    DISTANCE,
     GOAL_CELL,
     N_CELLS,
     Maps,
@@ -38,7 +39,6 @@ KINDS = {".": "reachable", "#": "walls", "?": "out of reach"}
 MIN_PAIRS = 100
 
 _Y, _X = np.divmod(np.arange(N_CELLS), SIZE)
-_DISTANCE = np.abs(_Y[None] - _Y[:, None]) + np.abs(_X[None] - _X[:, None])
 # The cells of every block inside the grid, (n_blocks, OBSTACLE_SIZE squared).
 _BLOCKS = np.array(
     [
@@ -122,7 +122,7 @@ def _kind_profile(maps: Maps, cells: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Mean sensitivity to the ``cells`` by distance from the agent (:data:`BINS`), NaN where there are too few."""
     means = []
     for low, high in BINS:
-        chosen = maps[:, (low <= _DISTANCE) & (high >= _DISTANCE) & cells]
+        chosen = maps[:, (low <= DISTANCE) & (high >= DISTANCE) & cells]
         values = chosen[~np.isnan(chosen)]
         means.append(values.mean() if len(values) >= MIN_PAIRS else np.nan)
     return np.array(means)
