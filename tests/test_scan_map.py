@@ -130,6 +130,7 @@ def test_walkable_keeps_the_agents_radius(scan):
 
 def test_walls_without_thickness_stop_the_agent(tmp_path):
     sheet = trimesh.Trimesh([(2.5, 0, 0), (2.5, 4, 0), (2.5, 4, 2), (2.5, 0, 2)], [(0, 1, 2), (0, 2, 3)], process=False)
+    sheet.visual.vertex_colors = (9, 9, 9, 255)
     scan = ScanMap.from_mesh(write(trimesh.Scene([floor(), sheet]), tmp_path / "sheet.glb"), up="z")
     _, column = at(scan, 2.5, 2)
     assert not scan.walkable[:, column - 3 : column + 3].any()

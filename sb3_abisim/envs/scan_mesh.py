@@ -34,7 +34,12 @@ _UNSUPPORTED = {
     "KHR_draco_mesh_compression": "Draco compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
     "EXT_meshopt_compression": "meshopt compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
     "KHR_texture_basisu": "KTX2 textures (convert them: `npx @gltf-transform/cli ktxdecompress IN OUT`)",
+    "KHR_mesh_quantization": "quantised vertices (undo it: `npx @gltf-transform/cli dequantize IN OUT`)",
 }
+# Extensions that a file may require and that change nothing seen from above, or that trimesh knows.
+_HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
+_FLOAT = 5126  # glTF's component type
+_UNMOVED = {"offset": [0, 0], "rotation": 0, "scale": [1, 1]}
 
 
 class SceneError(ValueError):
@@ -87,8 +92,7 @@ def load_mesh(path: str | os.PathLike[str], up: str = "auto") -> ScanMesh:
     path = Path(path)
     if up not in UP_AXES:
         raise ValueError(f"up must be one of {UP_AXES}, got {up!r}")
-    _check_file(path)
-    parts, files = _read(path)
+    parts, files = _read(path, _check_file(path))
     vertices, faces, surfaces = [], [], []
     n_vertices = 0
     for part_vertices, part_faces, surface in parts:
@@ -108,8 +112,8 @@ def load_mesh(path: str | os.PathLike[str], up: str = "auto") -> ScanMesh:
     return _turn_upright(path, mesh, up)
 
 
-def _check_file(path: Path) -> None:
-    """Refuse what can be told to be wrong without reading all of it."""
+def _check_file(path: Path) -> Any:
+    """Refuse what can be told to be wrong without reading all of it; gives a glTF file's JSON part, else {}."""
     if path.suffix.lower() not in SUFFIXES:
         raise SceneError(f"{path} is no scan file: its suffix must be one of {', '.join(SUFFIXES)}")
     if not path.is_file():
@@ -120,18 +124,19 @@ def _check_file(path: Path) -> None:
         raise SceneError(f"{path} is empty; download or copy it again")
     if head.startswith(b"version https://git-lfs"):
         raise SceneError(f"{path} is a Git LFS pointer, not the scan itself; run `git lfs pull` in its repository")
-    if path.suffix.lower() == ".glb":
-        _check_extensions(path, _glb_header(path, head))
-    elif path.suffix.lower() == ".gltf":
-        try:
-            _check_extensions(path, json.loads(path.read_bytes()))
-        except ValueError as error:
-            if isinstance(error, SceneError):
-                raise
-            raise SceneError(f"{path} cannot be read ({error}); download or export it again") from error
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return {}
+    try:
+        header = _glb_header(path, head) if path.suffix.lower() == ".glb" else json.loads(path.read_bytes())
+        _check_extensions(path, header)
+    except SceneError:
+        raise
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise SceneError(f"{path} cannot be read ({error}); download or export it again") from error
+    return header
 
 
-def _glb_header(path: Path, head: bytes) -> dict[str, Any]:
+def _glb_header(path: Path, head: bytes) -> Any:
     if len(head) < 20 or head[:4] != b"glTF":
         raise SceneError(f"{path} is not a binary glTF file; download it again, or give it the suffix of its format")
     total, n_json = struct.unpack("<I", head[8:12])[0], struct.unpack("<I", head[12:16])[0]
@@ -139,23 +144,50 @@ def _glb_header(path: Path, head: bytes) -> dict[str, Any]:
         raise SceneError(f"{path} is truncated: it has {path.stat().st_size} of {total} bytes; download it again")
     with open(path, "rb") as file:
         file.seek(20)
-        try:
-            header: dict[str, Any] = json.loads(file.read(n_json))
-        except ValueError as error:
-            raise SceneError(f"{path} cannot be read ({error}); download or export it again") from error
-    return header
+        return json.loads(file.read(n_json))
 
 
 def _check_extensions(path: Path, header: dict[str, Any]) -> None:
+    """Refuse what trimesh passes over and would show as something else."""
     for name in header.get("extensionsRequired", []):
         if name in _UNSUPPORTED:
             raise SceneError(f"{path} uses {_UNSUPPORTED[name]}, which is not supported")
+        if not name.startswith(_HARMLESS):
+            raise SceneError(f"{path} needs the glTF extension {name}, which is not supported; export it without")
+    for primitive, texture in _textured(header):
+        moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
+        if texture.get("texCoord", 0) or any(moved.get(k, v) != v for k, v in _UNMOVED.items()):
+            raise SceneError(
+                f"{path} has a colour texture in a second set of coordinates, or moved or repeated by "
+                "KHR_texture_transform, which is not supported; bake the texture (in Blender) and export it again"
+            )
+        coordinates = primitive["attributes"].get("TEXCOORD_0")
+        if coordinates is not None and header["accessors"][coordinates]["componentType"] != _FLOAT:
+            raise SceneError(f"{path} uses {_UNSUPPORTED['KHR_mesh_quantization']}, which is not supported")
+
+
+def _textured(header: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """The primitives of a glTF file whose material has a colour texture, each with the reference to it."""
+    found = []
+    for primitive in (p for mesh in header.get("meshes", []) for p in mesh["primitives"]):
+        material = header["materials"][primitive["material"]] if "material" in primitive else {}
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        if texture is not None:
+            found.append((primitive, texture))
+    return found
+
+
+def _count_pictures(header: Any) -> int:
+    """How many pictures a glTF file's colours come from."""
+    textures = {t["index"] for primitive, t in _textured(header) if "TEXCOORD_0" in primitive["attributes"]}
+    used = [header["textures"][index] for index in textures]
+    return len({t.get("extensions", {}).get("EXT_texture_webp", t)["source"] for t in used})
 
 
 _Part = tuple[NDArray[np.float64], NDArray[np.int64], Surface]
 
 
-def _read(path: Path) -> tuple[list[_Part], dict[str, str]]:
+def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
     try:
         import trimesh
     except ImportError as error:
@@ -182,15 +214,32 @@ def _read(path: Path) -> tuple[list[_Part], dict[str, str]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            data = io.BytesIO(path.read_bytes())
+            data, kind = path.read_bytes(), path.suffix[1:].lower()
+            # trimesh takes a material for all there is; MeshLab writes one beside the vertices' colours.
+            coloured = kind == "obj" and b"\nvt " not in data and re.search(rb"^v(\s+\S+){6}\s*$", data, re.M)
+            options: dict[str, Any] = {"skip_materials": True} if coloured else {}
             scene = trimesh.load_scene(
-                data, file_type=path.suffix[1:].lower(), resolver=Recorder(str(path)), process=False
+                io.BytesIO(data),
+                file_type=kind,
+                resolver=Recorder(str(path)),
+                process=False,
+                **options,
             )
             parts = _parts(scene, trimesh, missing)
     except Exception as error:  # what trimesh raises for a damaged file depends on where the damage is
         lost = f"; it refers to {missing[0]}, which is not there" if missing else ""
         raise SceneError(f"{path} cannot be read ({type(error).__name__}: {error}){lost}; export it again") from error
     warn_missing(path, missing)
+    meshes = [geometry for geometry in scene.geometry.values() if isinstance(geometry, trimesh.Trimesh)]
+    visuals: list[Any] = [mesh.visual for mesh in meshes]
+    pictures = {id(_material(visual.material)[0]) for visual in visuals if visual.kind == "texture"} - {id(None)}
+    if not missing and len(pictures) < (n_pictures := _count_pictures(header)):
+        raise SceneError(
+            f"{path}: {n_pictures - len(pictures)} of {n_pictures} textures cannot be decoded; export it again with "
+            "PNG or JPEG textures"
+        )
+    if n_bare := sum(visual.kind is None for visual in visuals):
+        warnings.warn(f"{path}: {n_bare} of {len(visuals)} parts have no colour and are drawn grey", stacklevel=3)
     if not parts:
         kind = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
         raise SceneError(f"{path} is {kind}: it has no faces; export the scan as a mesh of triangles")

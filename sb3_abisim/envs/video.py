@@ -45,7 +45,8 @@ def decode_video(path: Path) -> Iterator["Image.Image"]:
     """The frames of a video file.
 
     :param path: the file
-    :raises ClipError: if it cannot be decoded or has fewer frames than its header promises
+    :raises ClipError: if it cannot be decoded or has fewer frames than its header promises (which a complete video does
+        that shows a part of its frames, or whose frame rate varies)
     :raises ImportError: if the decoder is not installed
     """
     av = _import_decoder("av")
@@ -65,7 +66,10 @@ def decode_video(path: Path) -> Iterator["Image.Image"]:
             f"{path} cannot be decoded after {count} frames ({error}); replace the file or remove it"
         ) from error
     if promised is not None and count < share * promised:
-        raise ClipError(f"decoded {count} of {promised} frames of {path}: the file is cut off; get a complete copy")
+        raise ClipError(
+            f"decoded {count} of {promised} frames of {path}: the file is cut off, or its frames are not evenly timed; "
+            f"get a complete copy or, if it plays to its end, even it out: ffmpeg -i {path.name} -fps_mode cfr even.mp4"
+        )
 
 
 def _promise(container: Any, path: Path) -> tuple[int | None, float]:
