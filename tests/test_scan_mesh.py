@@ -119,3 +119,13 @@ def test_a_texture_beside_a_gltf_file_that_is_lost_is_a_warning(tmp_path):
     with pytest.warns(UserWarning, match=r"scan.gltf refers to lost\.png, which is not there"):
         (surface,) = load_mesh(path).surfaces
     assert surface.texture is None
+
+
+def test_a_part_without_coordinates_needs_no_texture(tmp_path):
+    path = edited(
+        write(trimesh.Scene([floor()]), tmp_path / "floor.glb"),
+        lambda header: header["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"),
+        damage_picture,
+    )
+    (surface,) = load_mesh(path).surfaces
+    assert surface.texture is None
