@@ -60,9 +60,9 @@ def solve(
         if k % 2 and toggle:
             # Half of them nearest to the cell.
             agents = np.intersect1d(agents, others)
-            agents = agents[np.argsort(nav.DISTANCE[agents, cell], kind="stable")]
-            rest = generator.choice(agents[N_AGENTS // 2 :], N_AGENTS // 2)
-            agents = others = np.concatenate([agents[: N_AGENTS // 2], rest])
+            nearest = agents[np.argsort(nav.DISTANCE[agents, cell], kind="stable")[: N_AGENTS // 2]]
+            rest = generator.choice(np.setdiff1d(agents, nearest), N_AGENTS // 2)
+            agents = others = np.concatenate([nearest, rest])
         else:
             agents, others = generator.choice(agents, N_AGENTS), generator.choice(others, N_AGENTS)
         rows, columns = np.searchsorted(free, agents), np.searchsorted(other_free, others)
@@ -137,14 +137,13 @@ def main() -> None:
         objective="abisim",
         settings={
             "teacher": "exact metric",
-            "base_digest": base.digest,
+            "base": args.base,
             "c": args.c,
-            "n_layouts": args.n_layouts,
-            "n_updates": args.n_updates,
             "seed": args.seed,
-            "toggle": args.toggle,
+            "n_updates": args.n_updates,
+            **({} if args.toggle else {"toggle": False}),
         },
-        dataset_digest="no dataset",
+        dataset_digest="exact",
         golden_observations=frames[:4],
     )
 
