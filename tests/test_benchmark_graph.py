@@ -113,7 +113,21 @@ def test_a_given_encoder_is_known_by_its_content() -> None:
     assert run_labels([run]) == {run.name: "ssi"}, "as the paper's table calls it"
     several = build(dataclasses.replace(plan, methods=("ssi", "ssi=Nav2D-v0/ssi", "ssi=Nav2D-v0/ssi,frozen")))
     labels = list(run_labels(several).values())
-    assert labels == ["ssi", f"ssi={run.settings['encoder_digest'][:6]}", "ssi,frozen"]
+    assert labels == ["ssi", "ssi=ssi", "ssi,frozen"]
+
+
+def test_labels_of_several_given_encoders(tmp_path: Path) -> None:
+    words = []
+    for name in ("a/x_{seed}.safetensors", "b/x_{seed}.safetensors", "b/y.safetensors"):
+        path = tmp_path / ("x" * (len(words) + 1))  # write_encoder draws by the length of the name
+        write_encoder(path, "Nav2D-v0", "ssi")
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        path.rename(tmp_path / name.replace("{seed}", "7"))
+        words.append(f"ssi={tmp_path / name}")
+    plan = dataclasses.replace(
+        PLAN, methods=(*words, "acro=Nav2D-v0/acro,frozen"), env_ids=("Nav2D-v0",), seeds=(0,), encoder_seeds=(7,)
+    )
+    assert list(run_labels(build(plan)).values()) == ["ssi=a/x", "ssi=b/x", "ssi=y", "acro,frozen"]
 
 
 def test_given_encoders_of_several_seeds(tmp_path: Path) -> None:

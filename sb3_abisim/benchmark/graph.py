@@ -53,6 +53,7 @@ class Cell:
     :param output: what it makes, relative to the benchmark's folder
     :param proof: a file of the output whose digest is kept; "" for the output itself
     :param units: transitions, updates, steps or episodes, whichever it counts in
+    :param method: of a run, the plan's word that asked for it
     """
 
     kind: str
@@ -63,6 +64,7 @@ class Cell:
     output: str
     proof: str = ""
     units: int = 1
+    method: str = ""
 
     @property
     def key(self) -> str:
@@ -161,7 +163,7 @@ def build(plan: Plan) -> list[Cell]:
             for method in plan.methods:
                 encoder_seed = plan.encoder_seeds[i % len(plan.encoder_seeds)]
                 named = Method.parse(method.replace("{seed}", str(encoder_seed)))
-                run = run_cell(plan, env_id, named, seed, encoder_seed)
+                run = dataclasses.replace(run_cell(plan, env_id, named, seed, encoder_seed), method=method)
                 add(final_cell(plan, run) if plan.final_episodes else run)
     _check_owners(plan, list(cells.values()))
     return list(cells.values())
@@ -274,27 +276,29 @@ def _check_params(algo: str, names: Collection[str]) -> None:
 
 
 def run_labels(cells: list[Cell]) -> dict[str, str]:
-    """What a report calls the runs: their method, and the encoder where one seed has several given ones of the method.
+    """What a report calls the runs: their method, and the end of the encoder's path where a method is given several.
 
     :param cells: what :func:`build` made
     :return: name of each run's cell to its label
     """
     runs = [cell for cell in cells if cell.kind == "run"]
-    given: dict[tuple[str, str, int], set[str]] = {}
-    for run in runs:
-        same = (_method(run), run.settings["env_id"], run.settings["seed"])
-        given.setdefault(same, set()).add(run.settings.get("encoder_digest", ""))
-    several = {method for (method, _, _), digests in given.items() if len(digests) > 1}
-    labels = {}
-    for run in runs:
-        digest = run.settings.get("encoder_digest")
-        name, comma, frozen = _method(run).partition(",")
-        labels[run.name] = f"{name}{f'={digest[:6]}' if digest and _method(run) in several else ''}{comma}{frozen}"
-    return labels
+    labels = dict.fromkeys((run.method for run in runs), "")
+    for word in labels:
+        method = Method.parse(word)
+        alike = [m for m in map(Method.parse, labels) if (m.name, m.frozen) == (method.name, method.frozen)]
+        paths = [_parts(m.encoder) for m in alike if m.encoder]
+        end: tuple[str, ...] = ()
+        if method.encoder and len(alike) > 1:
+            parts = _parts(method.encoder)
+            ends = (parts[-n:] for n in range(1, len(parts) + 1))
+            end = next((end for end in ends if sum(p[-len(end) :] == end for p in paths) == 1), parts)
+        labels[word] = method.name + "=" * bool(end) + "/".join(end) + ",frozen" * method.frozen
+    return {run.name: labels[run.method] for run in runs}
 
 
-def _method(run: Cell) -> str:
-    return f"{run.settings['method']}{',frozen' if run.settings['frozen'] else ''}"
+def _parts(encoder: str) -> tuple[str, ...]:
+    """Of a path, without what is the same for all files or differs between seeds alone."""
+    return Path(re.sub(r"[-_.]?\{seed\}", "", encoder.removesuffix(".safetensors"))).parts
 
 
 def final_cell(plan: Plan, run: Cell) -> Cell:
