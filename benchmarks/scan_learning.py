@@ -1,8 +1,8 @@
 """What agents reach on ScanNav: ``python -m benchmarks.scan_learning RUN [RUN ...] -o FILE``.
 
-A RUN is the folder of a finished rl-zoo3 run on a frozen encoder (``logs/ppo/ScanNav-v0_1``). Beside it play an agent
-that acts at random, one that walks straight towards the goal, and one that knows the map. All play the same episodes,
-one per copy of the environment, so that short episodes count no more than long ones.
+A RUN is the folder of a finished rl-zoo3 run (``logs/ppo/ScanNav-v0_1``). Beside it play an agent that acts at random,
+one that walks straight towards the goal, and one that knows the map. All play the same episodes, one per copy of the
+environment, so that short episodes count no more than long ones.
 """
 
 import argparse
@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.tables import use_one_core
+from sb3_abisim.benchmark.evaluate import final_model
+from sb3_abisim.benchmark.runs import read_run
 
 PACKAGES = ("numpy", "torch", "stable_baselines3", "rl_zoo3", "gymnasium")
 # Points of a curve, each the mean over episodes that ended in its share of the training.
@@ -80,17 +82,6 @@ def play(player: Player, env_kwargs: dict[str, Any], n_episodes: int, seed: int)
     }
 
 
-def load_model(run: Path) -> Any:
-    """The trained model of a run, acting on pictures."""
-    from stable_baselines3 import PPO
-
-    from sb3_abisim.checkpoint import RUN_COPY
-    from sb3_abisim.frozen import fuse
-
-    model = PPO.load(run / "ScanNav-v0.zip", device="cpu")
-    return fuse(model, str(next(run.glob(f"*/{RUN_COPY}"))))
-
-
 def learning_curve(run: Path) -> dict[str, list[float]]:
     """Success and SPL of the episodes of training, by the steps of all copies together."""
     from stable_baselines3.common.monitor import load_results
@@ -132,26 +123,28 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="folder of a run of rl-zoo3")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="JSON file")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="PNG of the learning curves")
-    parser.add_argument("--env-kwargs", type=json.loads, default={}, metavar="JSON", help="those of the runs")
-    parser.add_argument("--command", nargs="*", default=[], help="what trained the runs, to be noted")
+    parser.add_argument("--env-kwargs", type=json.loads, metavar="JSON", help="(default: those of the first run)")
     parser.add_argument("--episodes", type=int, default=200, help="of each agent (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1000, help="of the first copy (default: %(default)s)")
     args = parser.parse_args(argv)
     use_one_core()
+    runs = [read_run(folder) for folder in args.runs]
+    if args.env_kwargs is None:
+        args.env_kwargs = runs[0].env_kwargs if runs else {}
     fixed = {"random": random_player(args.seed), "straight line": straight_player, "knows the map": oracle_player}
     result: dict[str, Any] = {
         "env_kwargs": args.env_kwargs,
-        "commands": args.command,
+        "commands": [run.command for run in runs],
         "episodes": args.episodes,
         "seed": args.seed,
         "agents": {n: play(player, args.env_kwargs, args.episodes, args.seed) for n, player in fixed.items()},
         "runs": [
             {
-                "name": run.name,
-                "final": play(model_player(load_model(run)), args.env_kwargs, args.episodes, args.seed),
-                "curve": learning_curve(run),
+                "name": f"{run.label}, seed {run.seed}",
+                "final": play(model_player(final_model(run)), args.env_kwargs, args.episodes, args.seed),
+                "curve": learning_curve(run.folder),
             }
-            for run in args.runs
+            for run in runs
         ],
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
     }
