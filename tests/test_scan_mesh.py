@@ -1,12 +1,14 @@
 """What trimesh passes over in silence and would show as something else."""
 
+import copy
 import json
 import struct
 
 import numpy as np
 import pytest
 import trimesh
-from scan_inputs import floor, own_cache, write  # noqa: F401
+from PIL import Image
+from scan_inputs import checkers, floor, own_cache, write  # noqa: F401
 
 from sb3_abisim.envs.scan_mesh import SceneError, load_mesh
 
@@ -39,20 +41,37 @@ def moved(**transform):
     return lambda header: colour_texture(header).update(extensions={"KHR_texture_transform": transform})
 
 
-def integer_coordinates(header):
-    attributes = header["meshes"][0]["primitives"][0]["attributes"]
-    header["accessors"][attributes["TEXCOORD_0"]].update(componentType=5123, normalized=True)
+def integers(name):
+    def edit(header):
+        attributes = header["meshes"][0]["primitives"][0]["attributes"]
+        header["accessors"][attributes[name]].update(componentType=5123, normalized=True)
+
+    return edit
+
+
+def glossy(**diffuse):
+    """The older kind of material, from which trimesh makes the newer one."""
+
+    def edit(header):
+        texture = header["materials"][0].pop("pbrMetallicRoughness")["baseColorTexture"]
+        values = {"diffuseTexture": {**texture, **diffuse}, "specularFactor": [0, 0, 0]}
+        header["materials"][0]["extensions"] = {"KHR_materials_pbrSpecularGlossiness": values}
+
+    return edit
 
 
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
         (require("KHR_mesh_quantization"), r"quantised vertices \(undo it: `npx @gltf-transform/cli dequantize"),
-        (integer_coordinates, "quantised vertices"),
+        (integers("POSITION"), "quantised vertices"),
+        (integers("TEXCOORD_0"), "quantised vertices"),
         (require("ACME_spheres"), "needs the glTF extension ACME_spheres, which is not supported; export it without"),
         (moved(scale=[2, 2]), "moved or repeated by KHR_texture_transform"),
         (moved(rotation=0.5), "moved or repeated by KHR_texture_transform"),
         (lambda header: colour_texture(header).update(texCoord=1), "a second set of coordinates"),
+        (moved(texCoord=1), "a second set of coordinates"),
+        (glossy(texCoord=1), "a second set of coordinates"),
         (lambda header: header["meshes"][0]["primitives"][0].update(material=7), "cannot be read"),
     ],
 )
@@ -83,32 +102,145 @@ def damage_picture(header, rest):
     [
         (lambda header: None, damage_picture),
         (lambda header: header["images"][0].update(mimeType="image/ktx2"), None),
+        (lambda header: header.update(textures=[{"extensions": {"KHR_texture_basisu": {"source": 0}}}]), None),
+        (glossy(), damage_picture),
     ],
-    ids=["damaged", "ktx2"],
+    ids=["damaged", "ktx2", "basisu", "glossy"],
 )
 def test_refuses_textures_that_cannot_be_decoded(tmp_path, edit, binary):
     path = edited(write(trimesh.Scene([floor()]), tmp_path / "floor.glb"), edit, binary)
-    with pytest.raises(SceneError, match=r"floor.glb: 1 of 1 textures cannot be decoded; export it again with PNG"):
+    with pytest.raises(SceneError, match=r"floor.glb: the textures of 1 of 1 parts cannot be decoded; export"):
         load_mesh(path)
+
+
+def test_refuses_textures_that_pillow_finds_too_large(tmp_path, monkeypatch):
+    path = write(trimesh.Scene([floor()]), tmp_path / "floor.glb")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 64 * 64 // 2 - 1)
+    with pytest.raises(SceneError, match=r"textures of 1 of 1 parts cannot be decoded; .* at most 8192 x 8192 pixels"):
+        load_mesh(path)
+
+
+def two_parts(second):
+    """Edit a file so that it has a second part, which is like the first but for its own texture and ``second``."""
+
+    def edit(header):
+        header["meshes"].append(copy.deepcopy(header["meshes"][0]))
+        header["materials"].append(copy.deepcopy(header["materials"][0]))
+        header["materials"][1]["pbrMetallicRoughness"]["baseColorTexture"]["index"] = 1
+        header["textures"].append({"source": 1})
+        header["images"].append({"uri": "data:image/png;base64,AAAA", "mimeType": "image/png"})
+        header["meshes"][1]["primitives"][0].update(material=1, **second)
+        header["nodes"].append({"mesh": 1})
+        header["scenes"][0]["nodes"].append(len(header["nodes"]) - 1)
+
+    return edit
+
+
+def test_one_texture_of_two_that_cannot_be_decoded(tmp_path):
+    path = write(trimesh.Scene([floor()]), tmp_path / "floor.glb")
+    edited(path, two_parts({}))
+    with pytest.raises(SceneError, match="textures of 1 of 2 parts cannot be decoded"):
+        load_mesh(path)
+
+    def without_coordinates(header):
+        header["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0")
+
+    edited(path, without_coordinates)
+    with pytest.raises(SceneError, match="textures of 1 of 1 parts cannot be decoded"):
+        load_mesh(path)
+
+
+def test_lines_need_no_texture(tmp_path):
+    path = edited(write(trimesh.Scene([floor()]), tmp_path / "floor.glb"), two_parts({"mode": 1}))
+    (surface,) = load_mesh(path).surfaces
+    assert surface.texture is not None
 
 
 def test_parts_without_any_colour_are_a_warning(tmp_path):
     bare = trimesh.Trimesh(floor().vertices, floor().faces, process=False)
-    path = write(trimesh.Scene([bare]), tmp_path / "bare.ply")
-    with pytest.warns(UserWarning, match=r"bare.ply: 1 of 1 parts have no colour and are drawn grey"):
+    for name in ("bare.ply", "bare.glb", "bare.obj"):
+        path = write(trimesh.Scene([bare]), tmp_path / name)
+        with pytest.warns(UserWarning, match=rf"{name}: 1 of 1 parts have no colour and are drawn grey"):
+            (surface,) = load_mesh(path).surfaces
+        assert (surface.coordinates == 160).all()
+
+
+def obj(path, colour="", coordinates=False, material="Kd 0 1 0", before_faces=""):
+    """A floor of 5 m x 4 m as an OBJ file with a material."""
+    corner = "/{0}" if coordinates else ""
+    lines = ["mtllib floor.mtl", *(f"v {x} {y} 0 {colour}".rstrip() for x, y in ((0, 0), (5, 0), (5, 4), (0, 4)))]
+    lines += ["vt 0 0", "vt 1 0", "vt 1 1", "vt 0 1"] * coordinates
+    lines += [before_faces, "usemtl paint"]
+    lines += ["f " + " ".join(str(i) + corner.format(i) for i in face) for face in ((1, 2, 3), (1, 3, 4))]
+    path.write_text("\n".join(lines) + "\n")
+    (path.parent / "floor.mtl").write_text(f"newmtl paint\n{material}\n")
+    return path
+
+
+@pytest.mark.parametrize("coordinates", [False, True])
+def test_obj_keeps_the_colours_of_vertices_beside_a_material(tmp_path, coordinates):
+    (surface,) = load_mesh(obj(tmp_path / "floor.obj", "1 0.2 0", coordinates)).surfaces
+    assert (surface.coordinates == (255, 51, 0)).all()
+
+
+def test_obj_prefers_a_texture_to_the_colours_of_vertices(tmp_path):
+    checkers().save(tmp_path / "floor.png")
+    (surface,) = load_mesh(obj(tmp_path / "floor.obj", "1 0.2 0", True, "map_Kd floor.png")).surfaces
+    assert np.array_equal(surface.texture, np.asarray(checkers()))
+
+
+@pytest.mark.parametrize("colour", ["", "1 0.2 0"])
+def test_obj_without_its_texture_is_one_warning_and_grey(tmp_path, colour):
+    path = obj(tmp_path / "floor.obj", colour, True, "map_Kd lost.png")
+    with pytest.warns(UserWarning) as warned:
         (surface,) = load_mesh(path).surfaces
+    assert [str(warning.message).split(",")[0] for warning in warned] == [f"{path} refers to lost.png"]
     assert (surface.coordinates == 160).all()
 
 
-def test_obj_keeps_the_colours_of_vertices_beside_a_material(tmp_path):
-    path = write(trimesh.Scene([floor(False)]), tmp_path / "floor.obj")
-    (plain,) = load_mesh(path).surfaces
-    (tmp_path / "floor.mtl").write_text("newmtl grey\nKd 0.5 0.5 0.5\n")
-    lines = path.read_text().splitlines()
-    first = next(i for i, line in enumerate(lines) if line.startswith("f "))
-    path.write_text("\n".join(["mtllib floor.mtl", *lines[:first], "usemtl grey", *lines[first:]]) + "\n")
-    (coloured,) = load_mesh(path).surfaces
-    assert plain.coordinates.std() > 50 and np.array_equal(plain.coordinates, coloured.coordinates)
+def test_obj_with_colours_of_vertices_needs_no_material(tmp_path):
+    path = obj(tmp_path / "floor.obj", "1 0.2 0")
+    (tmp_path / "floor.mtl").unlink()
+    (surface,) = load_mesh(path).surfaces
+    assert (surface.coordinates == (255, 51, 0)).all()
+
+
+@pytest.mark.parametrize("before_faces", ["", "# 4 vertices\n"])  # 3ds Max: a line that looks like three colours
+def test_obj_keeps_the_colour_of_a_material(tmp_path, before_faces):
+    (surface,) = load_mesh(obj(tmp_path / "floor.obj", before_faces=before_faces)).surfaces
+    assert (surface.coordinates == (0, 255, 0)).all()
+
+
+@pytest.mark.parametrize("coordinates", [False, True])
+@pytest.mark.parametrize("material", ["Ns 10", "Kd 0 1 0\n\nnewmtl other"], ids=["no colour", "unused"])
+def test_obj_whose_material_has_no_colour_is_a_warning(tmp_path, coordinates, material):
+    path = obj(tmp_path / "floor.obj", "", coordinates, material)
+    if "other" in material:
+        path.write_text(path.read_text().replace("usemtl paint", "usemtl nothing"))
+    with pytest.warns(UserWarning, match=r"floor.obj: 1 of 1 parts have no colour and are drawn grey"):
+        (surface,) = load_mesh(path).surfaces
+    assert surface.texture is None and (surface.coordinates == 160).all()
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply"])
+def test_refuses_a_texture_beside_the_scan_that_cannot_be_decoded(tmp_path, suffix):
+    path = obj(tmp_path / "floor.obj", "", True, "map_Kd floor.png")
+    if suffix == "ply":
+        path = write(trimesh.Scene([floor()]), tmp_path / "floor.ply")
+        path.write_bytes(path.read_bytes().replace(b"comment", b"comment TextureFile floor.png\ncomment", 1))
+    checkers().save(tmp_path / "floor.png")
+    (surface,) = load_mesh(path).surfaces
+    assert np.array_equal(surface.texture, np.asarray(checkers()))
+    (tmp_path / "floor.png").write_text("version https://git-lfs.github.com/spec/v1\n")
+    with pytest.raises(SceneError, match=rf"floor\.{suffix}: the texture floor\.png cannot be decoded; export"):
+        load_mesh(path)
+
+
+def test_ply_with_coordinates_and_no_texture_is_a_warning(tmp_path):
+    path = write(trimesh.Scene([floor()]), tmp_path / "floor.ply")
+    with pytest.warns(UserWarning, match=r"floor.ply: 1 of 1 parts have no colour and are drawn grey"):
+        (surface,) = load_mesh(path).surfaces
+    assert surface.texture is None and (surface.coordinates == 160).all()
 
 
 def test_a_texture_beside_a_gltf_file_that_is_lost_is_a_warning(tmp_path):

@@ -1,5 +1,6 @@
 """A user's own videos: finding, splitting, decoding, cache, and every mistake with its remedy."""
 
+import struct
 import sys
 
 import numpy as np
@@ -31,10 +32,13 @@ def shade(seed, frame):
     return (40 * seed + 2 * frame) % 250
 
 
-def write_video(path, seed=0, n_frames=64, size=(96, 72), codec="mpeg4", title=None):
-    """A video whose frames brighten one by one; black outside of the central square."""
+def write_video(path, seed=0, n_frames=64, size=(96, 72), codec="mpeg4", title=None, n_hidden=0, pause=0, options=None):
+    """A video whose frames brighten one by one; black outside of the central square.
+
+    The first ``n_hidden`` come before its beginning; its middle frame stands for ``pause`` frames more.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
+    with av.open(str(path), "w", options=options or {}) as container:
         if title:
             container.metadata["title"] = title
         stream = container.add_stream(codec, rate=25)
@@ -45,7 +49,9 @@ def write_video(path, seed=0, n_frames=64, size=(96, 72), codec="mpeg4", title=N
         for i in range(n_frames):
             pixels = np.zeros((size[1], size[0], 3), dtype=np.uint8)
             pixels[:, margin : size[0] - margin] = shade(seed, i)
-            for packet in stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")):
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts = i - n_hidden + (pause if i > n_frames // 2 else 0)
+            for packet in stream.encode(frame):
                 container.mux(packet)
         for packet in stream.encode():
             container.mux(packet)
@@ -117,6 +123,19 @@ class TestDecoding:
         for seed in range(2):
             write_video(folder / f"{seed}.mkv", seed)
         assert [clips.lengths.tolist() for clips in both(folder)] == [[64], [64]]
+
+    def test_a_trimmed_mp4_file_shows_a_part_of_its_frames(self, folder):
+        path = write_video(folder / "trimmed.mp4", n_hidden=20)
+        raw = path.read_bytes()
+        entry = raw.index(b"elst") + 12  # what an editor writes: length in ms and beginning
+        assert struct.unpack(">I", raw[entry : entry + 4])[0] == 40 * 44
+        for n_shown in (44, 30):
+            path.write_bytes(raw[:entry] + struct.pack(">I", 40 * n_shown) + raw[entry + 4 :])
+            with av.open(str(path)) as container:
+                assert container.streams.video[0].frames == 64
+            shades = [np.asarray(image)[36, 48, 0] for image in video.decode_video(path)]
+            expected = shade(0, 20 + np.arange(n_shown))
+            assert len(shades) == n_shown and np.abs(np.array(shades, dtype=int) - expected).max() <= 8
 
     def test_in_the_environment(self, folder):
         two_folders(folder)
@@ -319,6 +338,21 @@ class TestMistakes:
         path = write_video(folder / "half.mkv", 0, 200)
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
         with pytest.raises(video.ClipError, match=r"decoded \d+ of 200 frames of .*half\.mkv: the file is cut off"):
+            list(video.decode_video(path))
+
+    @pytest.mark.parametrize(("name", "hidden", "left"), [("a.mp4", 20, 100), ("a.mp4", 20, 195), ("a.avi", 0, 150)])
+    def test_cut_off_between_two_frames(self, folder, name, hidden, left):
+        path = write_video(folder / name, 0, 200, n_hidden=hidden, options={"movflags": "faststart"})
+        with av.open(str(path)) as container:
+            starts = [packet.pos for packet in container.demux() if packet.size]
+        assert len(list(video.decode_video(path))) == 200 - hidden
+        path.write_bytes(path.read_bytes()[: starts[left - 200]])
+        with pytest.raises(video.ClipError, match=rf"decoded {left - hidden} of 200 frames .*{name}: the file is cut"):
+            list(video.decode_video(path))
+
+    def test_a_matroska_file_whose_frames_are_not_evenly_timed_names_the_remedy(self, folder):
+        path = write_video(folder / "uneven.mkv", pause=100)
+        with pytest.raises(video.ClipError, match=r"64 of 164 .*: ffmpeg -i uneven\.mkv -fps_mode cfr even\.mp4"):
             list(video.decode_video(path))
 
     def test_damage_in_the_middle_that_the_decoder_conceals(self, folder):

@@ -35,7 +35,7 @@ SLICE_DISTANCE = 0.1  # m
 # Pinholes of a scan's floor up to this wide do not stop anyone.
 PINHOLE = 0.06  # m
 # Part of the cache's keys: raise it where the same mesh gives another map.
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -39,6 +40,10 @@ _UNSUPPORTED = {
 # Extensions that a file may require and that change nothing seen from above, or that trimesh knows.
 _HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
 _FLOAT = 5126  # glTF's component type
+_TRIANGLES = (4, 5)  # glTF's modes that trimesh reads
+_PICTURES = "export it again with PNG or JPEG textures of at most 8192 x 8192 pixels"  # Pillow refuses far larger ones
+_COLOURED_VERTEX = re.compile(rb"^v(?:[ \t]+[-+.\deE]+){6}[ \t\r]*$", re.MULTILINE)  # of an OBJ file
+_TEXTURE_VERTEX = re.compile(rb"^vt[ \t].*$", re.MULTILINE)
 _UNMOVED = {"offset": [0, 0], "rotation": 0, "scale": [1, 1]}
 
 
@@ -154,34 +159,30 @@ def _check_extensions(path: Path, header: dict[str, Any]) -> None:
             raise SceneError(f"{path} uses {_UNSUPPORTED[name]}, which is not supported")
         if not name.startswith(_HARMLESS):
             raise SceneError(f"{path} needs the glTF extension {name}, which is not supported; export it without")
-    for primitive, texture in _textured(header):
+    for primitive, texture in _primitives(header):
+        names = {"POSITION", "TEXCOORD_0"} if texture else {"POSITION"}
+        read = [header["accessors"][index] for name, index in primitive["attributes"].items() if name in names]
+        if any(accessor["componentType"] != _FLOAT for accessor in read):
+            raise SceneError(f"{path} uses {_UNSUPPORTED['KHR_mesh_quantization']}, which is not supported")
         moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
-        if texture.get("texCoord", 0) or any(moved.get(k, v) != v for k, v in _UNMOVED.items()):
+        chosen = moved.get("texCoord", texture.get("texCoord", 0))
+        if chosen or any(moved.get(k, v) != v for k, v in _UNMOVED.items()):
             raise SceneError(
                 f"{path} has a colour texture in a second set of coordinates, or moved or repeated by "
                 "KHR_texture_transform, which is not supported; bake the texture (in Blender) and export it again"
             )
-        coordinates = primitive["attributes"].get("TEXCOORD_0")
-        if coordinates is not None and header["accessors"][coordinates]["componentType"] != _FLOAT:
-            raise SceneError(f"{path} uses {_UNSUPPORTED['KHR_mesh_quantization']}, which is not supported")
 
 
-def _textured(header: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """The primitives of a glTF file whose material has a colour texture, each with the reference to it."""
+def _primitives(header: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """A glTF file's runs of triangles, each with its material's reference to a colour texture, or {}."""
     found = []
     for primitive in (p for mesh in header.get("meshes", []) for p in mesh["primitives"]):
-        material = header["materials"][primitive["material"]] if "material" in primitive else {}
-        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-        if texture is not None:
-            found.append((primitive, texture))
+        if primitive.get("mode", 4) in _TRIANGLES:
+            material = header["materials"][primitive["material"]] if "material" in primitive else {}
+            glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+            metallic = material.get("pbrMetallicRoughness", {})
+            found.append((primitive, glossy.get("diffuseTexture") or metallic.get("baseColorTexture") or {}))
     return found
-
-
-def _count_pictures(header: Any) -> int:
-    """How many pictures a glTF file's colours come from."""
-    textures = {t["index"] for primitive, t in _textured(header) if "TEXCOORD_0" in primitive["attributes"]}
-    used = [header["textures"][index] for index in textures]
-    return len({t.get("extensions", {}).get("EXT_texture_webp", t)["source"] for t in used})
 
 
 _Part = tuple[NDArray[np.float64], NDArray[np.int64], Surface]
@@ -193,8 +194,10 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
     except ImportError as error:
         raise ImportError("reading scans needs trimesh: pip install 'sb3_abisim[scan]'") from error
 
+    kind = path.suffix[1:].lower()
     files = {path.name: file_digest(path)}
     missing: list[str] = []
+    damaged: list[str] = []
 
     class Recorder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc, unused-ignore]
         def get(self, name: str) -> bytes:
@@ -206,7 +209,10 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
                 file = folder / candidate
                 if file.resolve().is_relative_to(folder) and file.is_file():
                     files[candidate] = file_digest(file)
-                    return file.read_bytes()
+                    data = file.read_bytes()
+                    if kind in ("obj", "ply") and file.suffix.lower() != ".mtl" and not _is_picture(data):
+                        damaged.append(candidate)
+                    return data
             files[beside] = ""
             missing.append(name)
             raise FileNotFoundError(name)
@@ -214,36 +220,62 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            data, kind = path.read_bytes(), path.suffix[1:].lower()
-            # trimesh takes a material for all there is; MeshLab writes one beside the vertices' colours.
-            coloured = kind == "obj" and b"\nvt " not in data and re.search(rb"^v(\s+\S+){6}\s*$", data, re.M)
-            options: dict[str, Any] = {"skip_materials": True} if coloured else {}
-            scene = trimesh.load_scene(
-                io.BytesIO(data),
-                file_type=kind,
-                resolver=Recorder(str(path)),
-                process=False,
-                **options,
-            )
+            load = partial(trimesh.load_scene, file_type=kind, resolver=Recorder(str(path)), process=False)
+            scene = _load(path.read_bytes(), kind, load, missing)
             parts = _parts(scene, trimesh, missing)
     except Exception as error:  # what trimesh raises for a damaged file depends on where the damage is
         lost = f"; it refers to {missing[0]}, which is not there" if missing else ""
         raise SceneError(f"{path} cannot be read ({type(error).__name__}: {error}){lost}; export it again") from error
     warn_missing(path, missing)
-    meshes = [geometry for geometry in scene.geometry.values() if isinstance(geometry, trimesh.Trimesh)]
-    visuals: list[Any] = [mesh.visual for mesh in meshes]
-    pictures = {id(_material(visual.material)[0]) for visual in visuals if visual.kind == "texture"} - {id(None)}
-    if not missing and len(pictures) < (n_pictures := _count_pictures(header)):
-        raise SceneError(
-            f"{path}: {n_pictures - len(pictures)} of {n_pictures} textures cannot be decoded; export it again with "
-            "PNG or JPEG textures"
-        )
-    if n_bare := sum(visual.kind is None for visual in visuals):
+    if damaged:
+        raise SceneError(f"{path}: the texture {damaged[0]} cannot be decoded; {_PICTURES}")
+    visuals = _visuals(scene)
+    n_textured = sum(bool(texture) and "TEXCOORD_0" in p["attributes"] for p, texture in _primitives(header))
+    if not missing and (n_lost := n_textured - sum(map(_shows_picture, visuals))) > 0:
+        raise SceneError(f"{path}: the textures of {n_lost} of {n_textured} parts cannot be decoded; {_PICTURES}")
+    if n_bare := sum(_is_bare(visual) and not (missing and visual.kind) for visual in visuals):
         warnings.warn(f"{path}: {n_bare} of {len(visuals)} parts have no colour and are drawn grey", stacklevel=3)
     if not parts:
-        kind = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
-        raise SceneError(f"{path} is {kind}: it has no faces; export the scan as a mesh of triangles")
+        found = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
+        raise SceneError(f"{path} is {found}: it has no faces; export the scan as a mesh of triangles")
     return parts, files
+
+
+def _is_picture(data: bytes) -> bool:
+    from PIL import Image
+
+    try:
+        Image.open(io.BytesIO(data))
+    except (OSError, Image.DecompressionBombError):
+        return False
+    return True
+
+
+def _load(data: bytes, kind: str, load: Callable[..., Any], missing: list[str]) -> Any:
+    """trimesh's scene, in which an OBJ file's vertices keep their colours unless it shows a texture."""
+    if kind != "obj" or not _COLOURED_VERTEX.search(data):
+        return load(io.BytesIO(data))
+    # trimesh takes materials and texture coordinates for all there is; MeshLab writes them beside vertices' colours.
+    bare = _TEXTURE_VERTEX.sub(b"", data)
+    if bare != data:
+        scene = load(io.BytesIO(data))
+        if missing or any(map(_shows_picture, _visuals(scene))):
+            return scene
+    return load(io.BytesIO(bare), skip_materials=True)
+
+
+def _visuals(scene: Any) -> list[Any]:
+    return [geometry.visual for geometry in scene.geometry.values() if hasattr(geometry, "faces")]
+
+
+def _shows_picture(visual: Any) -> bool:
+    return visual.kind == "texture" and visual.uv is not None and _material(visual.material)[0] is not None
+
+
+def _is_bare(visual: Any) -> bool:
+    if visual.kind != "texture" or hasattr(visual.material, "baseColorFactor"):
+        return visual.kind is None
+    return _material(visual.material)[0] is None and "kd" not in visual.material.kwargs
 
 
 def warn_missing(source: str | os.PathLike[str], names: Iterable[str]) -> None:
@@ -310,12 +342,12 @@ def _material(material: Any) -> tuple[Any, NDArray[np.float32]]:
         linear = np.asarray(factor, dtype=np.float32)[:3] / 255
         # glTF's factors are linear light.
         return image, (255 * np.clip(linear, 0, 1) ** (1 / 2.2)).astype(np.float32)
-    image = material.image
-    diffuse = getattr(material, "diffuse", None)
-    # Many OBJ exporters write a grey or black Kd beside the texture and mean the texture alone.
-    if image is not None or diffuse is None:
-        return image, np.full(3, 255, dtype=np.float32)
-    return None, np.asarray(diffuse, dtype=np.float32)[:3]
+    # trimesh gives coordinates without a material a grey picture of its own, which has no file format.
+    if material.image is not None and material.image.format:
+        # Many OBJ exporters write a grey or black Kd beside the texture and mean the texture alone.
+        return material.image, np.full(3, 255, dtype=np.float32)
+    # trimesh's diffuse colour is another grey where the file has none.
+    return None, np.array(material.diffuse[:3] if "kd" in material.kwargs else MISSING_COLOUR, dtype=np.float32)
 
 
 def level_areas(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

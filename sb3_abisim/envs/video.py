@@ -5,7 +5,8 @@ named by the hash of the original's content, so that a renamed video is found ag
 for the old.
 
 Decoders go on silently after damage: half a file decodes to half of the frames without an error. What was decoded is
-therefore compared with what the file's header or the numbers of the frames promise.
+therefore compared with what the file's header or the numbers of the frames promise. An MP4 file that an editor has
+trimmed counts frames that are not shown; it is complete if its last frame ends when the header says.
 """
 
 import hashlib
@@ -45,27 +46,31 @@ def decode_video(path: Path) -> Iterator["Image.Image"]:
     """The frames of a video file.
 
     :param path: the file
-    :raises ClipError: if it cannot be decoded or has fewer frames than its header promises (which a complete video does
-        that shows a part of its frames, or whose frame rate varies)
+    :raises ClipError: if it cannot be decoded or has fewer frames than its header promises (so does a complete Matroska
+        file whose frame rate varies)
     :raises ImportError: if the decoder is not installed
     """
     av = _import_decoder("av")
-    count = 0
+    count, end, length = 0, 0.0, None
     try:
         # Titles and the like may be in any encoding.
         with av.open(str(path), metadata_errors="ignore") as container:
             promised, share = _promise(container, path)
+            length = _mp4_length(container)
             container.streams.video[0].thread_type = "AUTO"
             for frame in container.decode(video=0):
                 if frame.is_corrupt:
                     raise ClipError(f"frame {count} of {path} is damaged; replace the file or remove it")
                 yield frame.to_image()
                 count += 1
+                if length is not None and frame.pts is not None:
+                    end = float((frame.pts + frame.duration) * frame.time_base)
     except av.FFmpegError as error:
         raise ClipError(
             f"{path} cannot be decoded after {count} frames ({error}); replace the file or remove it"
         ) from error
-    if promised is not None and count < share * promised:
+    complete = length is not None and end >= share * length
+    if promised is not None and count < share * promised and not complete:
         raise ClipError(
             f"decoded {count} of {promised} frames of {path}: the file is cut off, or its frames are not evenly timed; "
             f"get a complete copy or, if it plays to its end, even it out: ffmpeg -i {path.name} -fps_mode cfr even.mp4"
@@ -88,6 +93,18 @@ def _promise(container: Any, path: Path) -> tuple[int | None, float]:
         # In microseconds, and of the longest stream, which may be the sound.
         return round(container.duration * rate / 1_000_000), 0.9
     return None, 0.0
+
+
+def _mp4_length(container: Any) -> float | None:
+    """When an MP4 or MOV file's last frame ends, in seconds.
+
+    None for other formats: what is left of an AVI file tells its own length, and Matroska steps over damage, so that a
+    piece lost from the middle cannot be told from a still picture.
+    """
+    stream = container.streams.video[0]
+    if "mp4" not in container.format.name or stream.duration is None:
+        return None
+    return float(((stream.start_time or 0) + stream.duration) * stream.time_base)
 
 
 def _decode_images(source: Source) -> Iterator["Image.Image"]:
