@@ -1,81 +1,15 @@
-"""A user's own videos: finding, splitting, decoding, cache, and every mistake with its remedy."""
+"""A user's own videos: decoding, own_cache, and every mistake with its remedy."""
 
 import struct
 import sys
 
 import numpy as np
 import pytest
+from video_inputs import Image, av, both, own_cache, shade, shown, two_folders, videos_folder, write_frames, write_video  # noqa: F401
 
 from sb3_abisim.envs import video
 from sb3_abisim.envs.backgrounds import load_backgrounds
 from sb3_abisim.envs.distractors import DistractorPointMazeVectorEnv
-from sb3_abisim.envs.video_files import find_sources, natural_key, split_sources
-
-av = pytest.importorskip("av")
-Image = pytest.importorskip("PIL.Image")
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path, monkeypatch):
-    folder = tmp_path / "cache"
-    monkeypatch.setenv("SB3_ABISIM_CACHE", str(folder))
-    return folder
-
-
-@pytest.fixture
-def folder(tmp_path):
-    (tmp_path / "videos").mkdir()
-    return tmp_path / "videos"
-
-
-def shade(seed, frame):
-    return (40 * seed + 2 * frame) % 250
-
-
-def write_video(path, seed=0, n_frames=64, size=(96, 72), codec="mpeg4", title=None, n_hidden=0, pause=0, options=None):
-    """A video whose frames brighten one by one; black outside of the central square.
-
-    The first ``n_hidden`` come before its beginning; its middle frame stands for ``pause`` frames more.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w", options=options or {}) as container:
-        if title:
-            container.metadata["title"] = title
-        stream = container.add_stream(codec, rate=25)
-        stream.width, stream.height = size
-        stream.pix_fmt = "yuv420p"
-        stream.bit_rate = 4_000_000
-        margin = (size[0] - size[1]) // 2
-        for i in range(n_frames):
-            pixels = np.zeros((size[1], size[0], 3), dtype=np.uint8)
-            pixels[:, margin : size[0] - margin] = shade(seed, i)
-            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame.pts = i - n_hidden + (pause if i > n_frames // 2 else 0)
-            for packet in stream.encode(frame):
-                container.mux(packet)
-        for packet in stream.encode():
-            container.mux(packet)
-    return path
-
-
-def write_frames(folder, seed=0, numbers=range(20), pattern="frame{}.png", size=(80, 60)):
-    """Frame n is filled with its number (red) and the seed (green)."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for number in numbers:
-        Image.new("RGB", size, (number, seed, 7)).save(folder / pattern.format(number))
-    return folder
-
-
-def two_folders(folder):
-    return write_frames(folder / "a", 1), write_frames(folder / "b", 2)
-
-
-def both(folder, **kwargs):
-    return [load_backgrounds(folder, split, **kwargs) for split in ("train", "eval")]
-
-
-def shown(clips, index=0):
-    return clips.frames(np.full(clips.lengths[index], index), np.arange(clips.lengths[index]))
 
 
 class TestDecoding:
@@ -189,114 +123,6 @@ class TestCache:
         monkeypatch.delenv("SB3_ABISIM_CACHE")
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         assert video.cache_folder() == tmp_path / "sb3_abisim"
-
-
-def listed(folder, **kwargs):
-    sides = split_sources(find_sources(folder), kwargs.get("seed", 0), kwargs.get("eval_fraction", 0.25))
-    return {side: {source.name: source.group for source in sources} for side, sources in sides.items()}
-
-
-class TestSplit:
-    def test_groups_stay_together(self, folder):
-        for film in range(8):
-            for shot in range(3):
-                (folder / f"film{film}").mkdir(exist_ok=True)
-                (folder / f"film{film}" / f"{shot}.mp4").touch()
-        names = ("Kitchen [abc-EFGH_12]-000.mp4", "x/Kitchen [abc-EFGH_12]-001.mp4", "y/abc-EFGH_12_000010_000020.mp4")
-        for name in names:
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).touch()
-        sides = listed(folder)
-        assert not set(sides["train"].values()) & set(sides["eval"].values())
-        assert len(sides["train"]) + len(sides["eval"]) == 27
-        assert len(set(sides["eval"].values())) == 2  # a quarter of nine
-        groups = sides["train"] | sides["eval"]
-        assert {groups[name] for name in names} == {"abc-EFGH_12"}
-        assert groups["film3/1.mp4"] == "film3"
-        assert listed(folder, seed=1) != sides == listed(folder)
-
-    def test_no_shared_frame(self, folder):
-        for i in range(5):
-            write_frames(folder / f"clip{i}", i)
-        hashes = [{f.tobytes() for i in range(side.n_clips) for f in shown(side, i)} for side in both(folder)]
-        assert [len(side) for side in hashes] == [80, 20] and not hashes[0] & hashes[1]
-
-    @pytest.mark.parametrize("unseen", ["val", "valid", "validation", "test"])
-    def test_other_names_of_the_unseen_side(self, folder, unseen):
-        for name in ("train/0.mp4", f"{unseen}/0.mp4", f"{unseen}/1.mp4"):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).touch()
-        sides = listed(folder)
-        assert sorted(sides["train"]) == ["train/0.mp4"]
-        assert sorted(sides["eval"]) == [f"{unseen}/0.mp4", f"{unseen}/1.mp4"]
-
-    def test_links_to_folders_are_followed_once(self, folder, tmp_path):
-        write_frames(tmp_path / "disk" / "far", 1)
-        write_frames(folder / "near", 2)
-        (folder / "linked").symlink_to(tmp_path / "disk")
-        (tmp_path / "disk" / "back").symlink_to(folder)
-        assert [source.name for source in find_sources(folder)] == ["linked/far", "near"]
-
-    def test_folders_named_train_and_eval(self, folder):
-        for name in ("train/a/0.mp4", "train/b.mp4", "eval/a/0.mp4", "eval/c.mp4", "eval/d.mp4"):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).touch()
-        sides = listed(folder)
-        assert sorted(sides["train"]) == ["train/a/0.mp4", "train/b.mp4"]
-        assert sorted(sides["eval"]) == ["eval/a/0.mp4", "eval/c.mp4", "eval/d.mp4"]
-
-    def test_davis_root_uses_its_own_lists(self, folder):
-        lists = folder / "ImageSets" / "2017"
-        lists.mkdir(parents=True)
-        (lists / "train.txt").write_text("bear\nboat\n\n")
-        (lists / "val.txt").write_text("cows\n")
-        for seed, name in enumerate(("bear", "boat", "cows", "unlisted")):
-            write_frames(folder / "JPEGImages" / "480p" / name, seed, range(25), "{:05d}.jpg")
-        train, unseen = both(folder)
-        assert train.names == ("bear", "boat") and unseen.names == ("cows",)
-        assert train.lengths.tolist() == [25, 25]
-        (lists / "val.txt").write_text("camel\n")
-        with pytest.raises(ValueError, match=r"val\.txt lists 'camel'"):
-            find_sources(folder)
-        (lists / "val.txt").unlink()
-        with pytest.raises(ValueError, match=r"has no .*val\.txt; restore it"):
-            find_sources(folder)
-
-    def test_hidden_files_and_thumbnails_are_left_out(self, folder):
-        for name in ("a.mp4", "a.jpg", "._a.mp4", ".trash/b.mp4", "c/0.mp4"):
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).touch()
-        assert [source.name for source in find_sources(folder)] == ["a.mp4", "c/0.mp4"]
-
-    def test_a_division_is_known_whatever_its_spelling(self, folder):
-        for name in ("Training/a.mp4", "VAL/a.mp4", "VAL/b.mp4"):
-            (folder / name).parent.mkdir(exist_ok=True)
-            (folder / name).touch()
-        sides = {source.name: source.split for source in find_sources(folder)}
-        assert sides == {"Training/a.mp4": "train", "VAL/a.mp4": "eval", "VAL/b.mp4": "eval"}
-
-    def test_frames_beside_a_film_are_not_dropped(self, folder):
-        for i in range(5):
-            (folder / f"{i}.png").touch()
-        (folder / "preview.mp4").touch()
-        with pytest.raises(ValueError, match=r"holds 5 pictures beside preview\.mp4"):
-            find_sources(folder)
-
-    def test_one_group_leaves_a_side_empty(self, folder):
-        write_video(folder / "film" / "1.mp4"), write_video(folder / "film" / "2.mp4", 1)
-        with pytest.raises(ValueError, match=r"2 clips.*one group, 'film'.*add another video"):
-            load_backgrounds(folder)
-
-    def test_an_empty_side(self, folder):
-        (folder / "eval").mkdir()
-        write_video(folder / "train" / "1.mp4")
-        with pytest.raises(ValueError, match="eval side of the split has no clips"):
-            load_backgrounds(folder)
-
-    def test_the_same_content_on_both_sides(self, folder):
-        write_frames(folder / "a"), write_frames(folder / "b")
-        with pytest.raises(ValueError, match=r"[ab] \(train\) and .*[ab] \(eval\) have the same content; remove one"):
-            load_backgrounds(folder)
 
 
 class TestMistakes:
@@ -421,8 +247,3 @@ class TestMistakes:
         (name, value), *_ = kwargs.items()
         with pytest.raises(ValueError, match=f"{name} must .*{value}"):
             load_backgrounds(folder, **kwargs)
-
-
-def test_natural_key():
-    names = ["f10.png", "F9.png", "f1b.png", "f1.png", "10.png", "9.png"]
-    assert sorted(names, key=natural_key) == ["9.png", "10.png", "f1.png", "f1b.png", "F9.png", "f10.png"]
