@@ -118,7 +118,7 @@ def test_a_given_encoder_is_known_by_its_content() -> None:
 
 def test_labels_of_several_given_encoders(tmp_path: Path) -> None:
     words = []
-    for name in ("a/x_{seed}.safetensors", "b/x_{seed}.safetensors", "b/y.safetensors"):
+    for name in ("a/x_{seed}.safetensors", "b/x_{seed}.safetensors", "b/y.safetensors", "b/y_{seed}.safetensors"):
         path = tmp_path / ("x" * (len(words) + 1))  # write_encoder draws by the length of the name
         write_encoder(path, "Nav2D-v0", "ssi")
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -127,7 +127,9 @@ def test_labels_of_several_given_encoders(tmp_path: Path) -> None:
     plan = dataclasses.replace(
         PLAN, methods=(*words, "acro=Nav2D-v0/acro,frozen"), env_ids=("Nav2D-v0",), seeds=(0,), encoder_seeds=(7,)
     )
-    assert list(run_labels(build(plan)).values()) == ["ssi=a/x", "ssi=b/x", "ssi=y", "acro,frozen"]
+    # Where only {seed} tells two apart, they keep their whole names.
+    alike = [f"ssi={tmp_path}/b/y.safetensors", f"ssi={tmp_path}/b/y_{{seed}}.safetensors"]
+    assert list(run_labels(build(plan)).values()) == ["ssi=a/x", "ssi=b/x", *alike, "acro,frozen"]
 
 
 def test_given_encoders_of_several_seeds(tmp_path: Path) -> None:

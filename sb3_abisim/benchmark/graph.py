@@ -291,7 +291,7 @@ def run_labels(cells: list[Cell]) -> dict[str, str]:
         if method.encoder and len(alike) > 1:
             parts = _parts(method.encoder)
             ends = (parts[-n:] for n in range(1, len(parts) + 1))
-            end = next((end for end in ends if sum(p[-len(end) :] == end for p in paths) == 1), parts)
+            end = next((end for end in ends if sum(p[-len(end) :] == end for p in paths) == 1), (method.encoder,))
         labels[word] = method.name + "=" * bool(end) + "/".join(end) + ",frozen" * method.frozen
     return {run.name: labels[run.method] for run in runs}
 
