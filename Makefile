@@ -56,7 +56,7 @@ figures: setup  ## draw every figure of docs/figures.md anew from the committed 
 	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results
 
 # The folders of committed runs whose curves stand in docs/results.md.
-COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn
+COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
 
 comparisons: setup  ## draw every curve of docs/results.md anew from the committed runs; a minute
 	@for name in $(COMPARISONS); do \

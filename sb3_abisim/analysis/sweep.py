@@ -7,20 +7,19 @@ from sb3_abisim.pretrain import pretrain, read_env_id
 from sb3_abisim.pretrain_config import load_config
 
 PAPER_C = (0.25, 0.75, 0.85, 0.99)
-N_UPDATES = 2000
 
 
 def sweep_encoders(
-    values: list[float], base: str, folder: Path, data: Path | None, env_id: str, n_updates: int = N_UPDATES
+    values: list[float], base: str, folder: Path, data: Path | None, env_id: str, n_updates: int | None = None
 ) -> dict[float, EncoderFile]:
-    """The encoders of a sweep; those that ``folder`` does not hold are pretrained first, two minutes each on one core.
+    """The encoders of a sweep; those that ``folder`` does not hold are pretrained first, about five minutes each on one core.
 
     :param values: of c, each in [0, 1)
     :param base: file or name of the base encoder
     :param folder: holds ``abisim_c<c>.safetensors``
     :param data: dataset to pretrain on, needed for what is missing
     :param env_id: environment of the dataset
-    :param n_updates: of each pretraining
+    :param n_updates: of each pretraining; None for the environment's own setting
     :raises ValueError: for missing encoders without data, data of another environment, or encoders of another base
     """
     base_digest = load_encoder(base).digest
@@ -33,7 +32,8 @@ def sweep_encoders(
             if (found := read_env_id(data)) != env_id:
                 raise ValueError(f"{data} was collected in {found}, not in {env_id}")
             folder.mkdir(parents=True, exist_ok=True)
-            config = load_config("abisim", env_id, {"objective_kwargs.c": c, "n_updates": n_updates})
+            given = {} if n_updates is None else {"n_updates": n_updates}
+            config = load_config("abisim", env_id, {"objective_kwargs.c": c, **given})
             pretrain("abisim", data, path, config, base, device="cpu", verbose=0)
         files[c] = load_encoder(path)
         found_c = files[c].contract["settings"]["objective_kwargs"].get("c")

@@ -165,7 +165,7 @@ class ActionBisimulation(Objective):
     :param action_space: ``Discrete`` or one-dimensional ``Box``
     :param base_encoder: any trained encoder; frozen here
     :param c: weight of the recursive step, 0 <= c < 1
-    :param tau: rate of the target encoder, per update
+    :param tau: rate of the target encoder, per update; the smaller, the more updates it takes to look ahead
     :param expectation: "uniform" or "behaviour" (module docstring)
     :param distance_loss: "l1" (the paper), "smooth_l1" (the released code) or "mse"
     :param wasserstein: "means" or "gaussian", which also counts the predicted variance (:func:`w1_gaussian`)
