@@ -12,7 +12,7 @@ PAPER_C = (0.25, 0.75, 0.85, 0.99)
 def sweep_encoders(
     values: list[float], base: str, folder: Path, data: Path | None, env_id: str, n_updates: int | None = None
 ) -> dict[float, EncoderFile]:
-    """The encoders of a sweep; those that ``folder`` does not hold are pretrained first, about five minutes each on one core.
+    """The encoders of a sweep; what ``folder`` does not hold is pretrained first, some five minutes each on one core.
 
     :param values: of c, each in [0, 1)
     :param base: file or name of the base encoder
