@@ -9,11 +9,12 @@ import pytest
 from zoo_inputs import write_encoder
 
 from sb3_abisim import analyze
-from sb3_abisim.analysis import nav2d_exact, pixels, probes
+from sb3_abisim.analysis import nav2d_exact, pixels, probes, sweep
 from sb3_abisim.analysis.figures import FIGURES, default_encoders
 from sb3_abisim.analysis.sweep import sweep_encoders
 from sb3_abisim.checkpoint import load_encoder, resolve_encoder
 from sb3_abisim.collect import collect
+from sb3_abisim.pretrain_config import load_config
 from sb3_abisim.resources import resource_path
 
 PNG = b"\x89PNG\r\n"
@@ -72,6 +73,22 @@ def test_sweep_refuses_encoders_of_another_base(tmp_path):
     shutil.copy(resource_path("encoders") / "Nav2D-v0/abisim.safetensors", tmp_path / "abisim_c0.9.safetensors")
     with pytest.raises(ValueError, match="on another base encoder than Nav2D-v0/acro"):
         sweep_encoders([0.9], "Nav2D-v0/acro", tmp_path, None, "Nav2D-v0")
+
+
+def test_sweep_pretrains_as_long_as_the_environment_says(tmp_path, monkeypatch):
+    collect("Nav2D-v0", 40, tmp_path / "data", n_envs=2)
+    configs = []
+
+    def stand_in(objective, data, path, config, *rest, **kwargs):
+        configs.append(config)
+        shutil.copy(resource_path("encoders") / "Nav2D-v0/abisim.safetensors", path)
+
+    monkeypatch.setattr(sweep, "pretrain", stand_in)
+    sweep_encoders([0.9], "Nav2D-v0/ssi", tmp_path / "own", tmp_path / "data", "Nav2D-v0")
+    sweep_encoders([0.9], "Nav2D-v0/ssi", tmp_path / "short", tmp_path / "data", "Nav2D-v0", n_updates=3)
+    usual = load_config("abisim", "Nav2D-v0")
+    assert [config.n_updates for config in configs] == [usual.n_updates, 3]
+    assert configs[0].objective_kwargs == usual.objective_kwargs and usual.objective_kwargs["c"] == 0.9
 
 
 @pytest.mark.slow
