@@ -60,3 +60,16 @@ def test_a_new_clip_changes_most_pixels():
 def test_no_pixels_in_nav2d():
     with pytest.raises(ValueError, match="Nav2D-v0"):
         pixel_maps({}, "Nav2D-v0", 1)
+
+
+def test_one_state_has_no_other_to_be_compared_with():
+    with pytest.raises(ValueError, match="two states or more, got 1"):
+        pixel_maps({"identity": identity(SHAPE)}, "PointMaze-v0", 1)
+
+
+@pytest.mark.parametrize(("name", "value", "who"), [("GOAL_RADIUS", 100.0, "obstacle"), ("AGENT_RADIUS", 6.0, "agent")])
+def test_states_without_room_to_move_are_too_few(monkeypatch, name, value, who):
+    # A goal as wide as the room leaves no place for obstacles; an agent of six metres overlaps one everywhere.
+    monkeypatch.setattr(pixels, name, value)
+    with pytest.raises(ValueError, match=f"no {who} of 2 states has room to move"):
+        pixel_maps({"identity": identity(SHAPE)}, "PointMaze-v0", 2)

@@ -96,10 +96,12 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
     :return: per encoder and setting (:func:`clip_settings`), in units of the mean distance between two states on the
         same background: ``map`` by offset [dy, dx] in metres from agent to obstacle, ``profile`` by distance
         (:data:`BINS`), ``agent``, and ``clip`` (None without clips)
-    :raises ValueError: for an environment without pixels of this kind
+    :raises ValueError: for an environment without pixels of this kind, or too few states
     """
     if env_id not in ENV_IDS:
         raise ValueError(f"obstacles can be moved in {', '.join(ENV_IDS)}, got {env_id!r}")
+    if n_states < 2:
+        raise ValueError(f"distances between states need two states or more, got {n_states}")
     encoders: dict[str, Any] = {name: {"digest": file.digest, "settings": {}} for name, file in files.items()}
     for setting, env_kwargs in clip_settings(env_id).items():
         samples = sample_episodes(env_id, n_states, 1, seed, env_kwargs)
@@ -170,6 +172,8 @@ def _moves(
     gap = np.minimum(_edge_distance(agent, old), _edge_distance(agent, new))
     possible = (_edge_distance(agent, new) > AGENT_RADIUS) & (np.abs(new).max(axis=1) <= ROOM_SIZE / 2 - _HALF)
     possible &= np.abs(new).max(axis=1) >= GOAL_RADIUS + _HALF
+    if not possible.any():
+        raise ValueError(f"no obstacle of {n_states} states has room to move; take more states")
     layouts = obstacles[state]
     layouts[np.arange(len(state)), which] = new
     result = {"state": state, "obstacles": layouts, "gap": gap, "offset": (old + new) / 2 - agent}
@@ -187,6 +191,8 @@ def _nudged(
     free = np.abs(new).max(axis=1) <= ROOM_SIZE / 2 - AGENT_RADIUS
     for k in range(obstacles.shape[1]):
         free &= _edge_distance(new, obstacles[:, k]) > AGENT_RADIUS
+    if not free.any():
+        raise ValueError(f"no agent of {len(agents)} states has room to move; take more states")
     who = np.flatnonzero(free)
     return draw_point_mazes(new[who], obstacles[who], None if behind is None else behind[who]), who
 
