@@ -45,7 +45,10 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
             )
             (run / "DistractorPointMaze-v0.zip").write_bytes(bytes(10_000))
             (run / "best_model.zip").write_bytes(bytes(10_000))
-            (run / "0.monitor.csv").write_text("#{}\nr,l,t\n-1,1,0.1\n")
+            episodes = [
+                f"{-int(length)},{length},{k}.5,{k % 2 == 0}" for k, length in enumerate(rng.integers(1, 9, 100))
+            ]
+            (run / "0.monitor.csv").write_text('#{"t_start": 0.0}\nr,l,t,is_success\n' + "\n".join(episodes) + "\n")
             output = run.relative_to(root).as_posix()
             entries.append({"folder": output, "label": method})
             for kind, inputs in (("run", ["encoder-0"]), ("final", [f"run-{method}{seed}"])):
@@ -72,9 +75,10 @@ def copy(original: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
-def test_the_copy_gives_the_same_report(original: Path, copy: Path, tmp_path: Path) -> None:
-    first = report([str(original)], tmp_path / "first").parent
-    second = report([str(copy)], tmp_path / "second").parent
+@pytest.mark.parametrize("source", ["evaluations", "training"])
+def test_the_copy_gives_the_same_report(original: Path, copy: Path, tmp_path: Path, source: str) -> None:
+    first = report([str(original)], tmp_path / "first", source=source).parent
+    second = report([str(copy)], tmp_path / "second", source=source).parent
     names = sorted(path.name for path in first.iterdir())
     assert names == sorted(path.name for path in second.iterdir()) and "splits.png" in names
     for name in names:
@@ -87,7 +91,8 @@ def test_the_copy_gives_the_same_report(original: Path, copy: Path, tmp_path: Pa
 def test_nothing_but_what_the_report_reads(copy: Path) -> None:
     names = {path.name for path in copy.rglob("*") if path.is_file() and path.parent.name != "cells"}
     assert names == {
-        "benchmark.json", "args.yml", "config.yml", "command.txt", "evaluations.npz", "final_evaluations.npz"
+        "benchmark.json", "args.yml", "config.yml", "command.txt", "evaluations.npz", "final_evaluations.npz",
+        "training.npz",
     }  # fmt: skip
     cells = {path.stem for path in (copy / "cells").iterdir()}
     assert cells == {f"{kind}-{method}{seed}" for kind in ("run", "final") for method in ("abisim", "vanilla")
@@ -117,7 +122,7 @@ def test_without_folders(tmp_path: Path) -> None:
 
 
 def test_the_arrays_are_the_same_and_smaller(original: Path, copy: Path) -> None:
-    for path in copy.glob("**/*.npz"):
+    for path in copy.glob("**/*evaluations.npz"):
         source = original / path.relative_to(copy)
         with np.load(source) as before, np.load(path) as after:
             assert set(before) == set(after)
@@ -127,11 +132,16 @@ def test_the_arrays_are_the_same_and_smaller(original: Path, copy: Path) -> None
         assert path.stat().st_size < source.stat().st_size
 
 
-def test_training_episodes_are_missed_by_name(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_copy_without_training_curves_says_so(copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As copies were before they kept that curve; a copy of a copy keeps what that has."""
+    again = export(copy, tmp_path / "again")
+    assert len(list(again.glob("**/training.npz"))) == 4
+    for path in again.glob("**/training.npz"):
+        path.unlink()
     with pytest.raises(SystemExit) as stopped:
-        main(["report", str(copy), "--source", "training"])
+        main(["report", str(export(again, tmp_path / "bare")), "--source", "training"])
     assert stopped.value.code == 2
-    assert "an exported benchmark keeps no training episodes); take --source evaluations" in capsys.readouterr().err
+    assert "holds neither *.monitor.csv nor training.npz; take --source evaluations" in capsys.readouterr().err
 
 
 def test_plain_zoo_logs_and_refusals(tmp_path: Path, copy: Path) -> None:

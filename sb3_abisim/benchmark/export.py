@@ -1,6 +1,7 @@
 """Copy of a benchmark that is small enough to commit: what the report reads, and how each cell was made.
 
-Models, datasets, encoders and monitor files stay behind, and so do the names of the folders that they lay in.
+Models, datasets, encoders and monitor files stay behind, and so do the names of the folders that they lay in. Of the
+training episodes the curve stays.
 """
 
 import io
@@ -11,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_abisim.atomic import write_atomic
-from sb3_abisim.benchmark.runs import Run, find_runs
+from sb3_abisim.benchmark.runs import TRAINING_CURVE, Run, find_runs
 
 INDEX_NAME = "benchmark.json"
 TEXTS = ("args.yml", "config.yml", "command.txt")
@@ -28,7 +30,7 @@ def export(folder: str | Path, output: str | Path) -> Path:
     :param folder: a benchmark's folder, or a zoo's log folder
     :param output: a new folder
     :return: ``output``
-    :raises ValueError: if there are no runs, or ``output`` is there
+    :raises ValueError: if there are no runs, one cannot be read, or ``output`` is there
     """
     folder, output = Path(folder), Path(output)
     if output.exists():
@@ -65,9 +67,15 @@ def _copy_run(run: Run, root: Path, target: Path) -> None:
     for name in EVALUATIONS:
         if (run.folder / name).is_file():
             with np.load(run.folder / name, allow_pickle=False) as arrays:
-                buffer = io.BytesIO()
-                np.savez_compressed(buffer, **arrays)
-            write_atomic(target / name, lambda file, buffer=buffer: file.write(buffer.getvalue()))  # type: ignore[misc]
+                _write_arrays(target / name, dict(arrays))
+    if not (any(run.folder.glob("*.monitor.csv")) or (run.folder / TRAINING_CURVE).is_file()):
+        return
+    curve = run.training()
+    # Shapes as in evaluations.npz, with one episode at each point.
+    columns = {"results": curve.returns} | ({} if curve.successes is None else {"successes": curve.successes})
+    _write_arrays(
+        target / TRAINING_CURVE, {"timesteps": curve.steps} | {key: value[:, None] for key, value in columns.items()}
+    )
 
 
 def _copy_markers(runs: list[Run], root: Path, target: Path) -> None:
@@ -83,6 +91,13 @@ def _copy_markers(runs: list[Run], root: Path, target: Path) -> None:
         # The name of a machine says nothing elsewhere.
         kept = {key: value for key, value in markers[name].items() if key != "host"}
         _write(target / "cells" / f"{name}.json", without_folders(json.dumps(kept, indent=1), root))
+
+
+def _write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_atomic(path, lambda file: file.write(buffer.getvalue()))
 
 
 def _write(path: Path, text: str) -> None:

@@ -32,6 +32,8 @@ _Loader.add_constructor(
 )
 
 
+# The training episodes of an exported run, averaged: see Run.training.
+TRAINING_CURVE = "training.npz"
 _ENCODER_NAME = re.compile(r"""['"]encoder['"]\s*:\s*(['"]).*?\1""")
 
 
@@ -84,26 +86,23 @@ class Run:
         path = self.folder / "evaluations.npz"
         if not path.is_file():
             raise ValueError(f"{self.folder} holds no evaluations.npz; train with an --eval-freq above 0")
-        try:
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-                successes = data["successes"].mean(axis=1) if "successes" in data else None
-                return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
-        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-            raise ValueError(
-                f"{path} is damaged or being written ({error!r}); try again, or leave the run out"
-            ) from error
+        return _read_curve(path)
 
     def training(self, n_points: int = 200) -> Curve:
         """The episodes of training itself, with the exploring policy, averaged over equal stretches of steps.
 
+        Exported runs hold this curve instead of the episodes, with the default number of stretches.
+
         :param n_points: stretches; those in which no episode ended are left out
-        :raises ValueError: if there are no monitor files
+        :raises ValueError: if there are neither episodes nor their curve
         """
         from stable_baselines3.common.monitor import load_results
 
         if not list(self.folder.glob("*.monitor.csv")):
-            what = f"{self.folder} holds no *.monitor.csv (an exported benchmark keeps no training episodes)"
-            raise ValueError(f"{what}; take --source evaluations, or the original folder")
+            if (self.folder / TRAINING_CURVE).is_file():
+                return _read_curve(self.folder / TRAINING_CURVE)
+            what = f"{self.folder} holds neither *.monitor.csv nor {TRAINING_CURVE}"
+            raise ValueError(f"{what}; take --source evaluations, or the folder that it was exported from")
         # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
         episodes = load_results(str(self.folder))
         if not len(episodes):
@@ -120,6 +119,20 @@ class Run:
         """What :mod:`sb3_abisim.benchmark.evaluate` wrote: ``<mode>/<split>/results`` and so on; None if it did not."""
         path = self.folder / "final_evaluations.npz"
         return dict(np.load(path, allow_pickle=False)) if path.is_file() else None
+
+
+def _read_curve(path: Path) -> Curve:
+    """A curve from arrays as the zoo's EvalCallback writes them.
+
+    :param path: an npz file with ``timesteps`` (n,), ``results`` (n, n_episodes) and, if known, ``successes`` alike
+    :raises ValueError: if it cannot be read
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
+            successes = data["successes"].mean(axis=1) if "successes" in data else None
+            return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} is damaged or being written ({error!r}); try again, or leave the run out") from error
 
 
 def read_run(folder: str | Path) -> Run:
