@@ -55,14 +55,17 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about a quarter of an hour
 	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results
 
-# The folders of committed runs whose curves stand in docs/results.md.
+# The folders of committed runs whose curves stand in docs/results.md: of evaluations, and of training episodes.
 COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
+TRAINING_COMPARISONS := distractor_frozen_longer
 
 comparisons: setup  ## draw every curve of docs/results.md anew from the committed runs; a minute
-	@for name in $(COMPARISONS); do \
-		$(BIN)/python -m sb3_abisim.benchmark report benchmarks/results/comparison/$$name -o build/comparisons/$$name && \
-		cp build/comparisons/$$name/curves.png docs/images/comparison-$$name.png || exit 1; \
-	done
+	@draw() { \
+		$(BIN)/python -m sb3_abisim.benchmark report benchmarks/results/comparison/$$1 -o build/comparisons/$$1 --source $$2 && \
+		cp build/comparisons/$$1/curves.png docs/images/comparison-$$1.png; \
+	}; \
+	for name in $(COMPARISONS); do draw $$name evaluations || exit 1; done; \
+	for name in $(TRAINING_COMPARISONS); do draw $$name training || exit 1; done
 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
 	$(BIN)/python -m sb3_abisim.benchmark -o benchmark
