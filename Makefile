@@ -58,14 +58,18 @@ figures: setup  ## draw every figure of docs/figures.md anew from the committed 
 # The folders of committed runs whose curves stand in docs/results.md: of evaluations, and of training episodes.
 COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
 TRAINING_COMPARISONS := distractor_frozen_longer
+# Stands beside the runs of nav2d_dqn_target.
+NAV2D_VANILLA := vanilla, 10,000=benchmarks/results/comparison/nav2d_dqn/runs/Nav2D-v0/vanilla-cd2b7a74
 
 comparisons: setup  ## draw every curve of docs/results.md anew from the committed runs; a minute
 	@draw() { \
-		$(BIN)/python -m sb3_abisim.benchmark report benchmarks/results/comparison/$$1 -o build/comparisons/$$1 --source $$2 && \
-		cp build/comparisons/$$1/curves.png docs/images/comparison-$$1.png; \
+		name=$$1; shift; \
+		$(BIN)/python -m sb3_abisim.benchmark report benchmarks/results/comparison/$$name "$$@" -o build/comparisons/$$name && \
+		cp build/comparisons/$$name/curves.png docs/images/comparison-$$name.png; \
 	}; \
-	for name in $(COMPARISONS); do draw $$name evaluations || exit 1; done; \
-	for name in $(TRAINING_COMPARISONS); do draw $$name training || exit 1; done
+	for name in $(COMPARISONS); do draw $$name || exit 1; done; \
+	for name in $(TRAINING_COMPARISONS); do draw $$name --source training || exit 1; done; \
+	draw nav2d_dqn_target "$(NAV2D_VANILLA)"
 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
 	$(BIN)/python -m sb3_abisim.benchmark -o benchmark
