@@ -88,7 +88,7 @@ class Run:
             raise ValueError(f"{self.folder} holds no evaluations.npz; train with an --eval-freq above 0")
         return _read_curve(path)
 
-    def training(self, n_points: int = 200) -> Curve:
+    def training(self, n_points: int = 50) -> Curve:
         """The episodes of training itself, with the exploring policy, averaged over equal stretches of steps.
 
         Exported runs hold this curve instead of the episodes, with the default number of stretches.
