@@ -1,6 +1,9 @@
 """PointMaze: physics against gymnasium-robotics' point body, layouts against a plain flood fill, pictures."""
 
+import copy
 import importlib.util
+import pickle
+from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
@@ -292,6 +295,29 @@ def test_reset_with_a_seed_determines_everything() -> None:
 
     assert play(1) == play(1)
     assert play(1)[0] != play(2)[0]
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("kwargs", [{"continuous": True}, {"momentum": True}])
+def test_a_copy_goes_on_bit_for_bit(
+    duplicate: Callable[[PointMazeVectorEnv], PointMazeVectorEnv], kwargs: dict[str, bool]
+) -> None:
+    env = PointMazeVectorEnv(num_envs=16, max_episode_steps=40, n_threads=2, **kwargs)
+    env.reset(seed=3)
+    generator = np.random.default_rng(6)
+    for _ in range(20):
+        env.step(random_actions(env, generator))
+    twin = duplicate(env)
+    assert twin._physics.nthread == 2
+    for _ in range(30):
+        actions = random_actions(env, generator)
+        (pictures, rewards, *_), (others, other_rewards, *_) = env.step(actions), twin.step(actions)
+        np.testing.assert_array_equal(pictures, others)
+        np.testing.assert_array_equal(rewards, other_rewards)
+        np.testing.assert_array_equal(env._position, twin._position)
+    # Two of each, not one.
+    place(twin, (3.0, 3.0))
+    assert not np.array_equal(env._position, twin._position)
 
 
 # Rewards, episode ends and pictures.

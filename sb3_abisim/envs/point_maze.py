@@ -38,6 +38,8 @@ _SAFE_VELOCITY = 4.0
 _FASTEST, _SLOWEST = np.array(MAX_VELOCITY), np.array(-MAX_VELOCITY)
 
 _N_WALLS = 4
+# What the next time step depends on; the solver begins from the last accelerations.
+_SIMULATION_STATE = ("qpos", "qvel", "qacc_warmstart")
 _CENTRE = IMAGE_SIZE // 2
 
 # The pixels (left, top, right, bottom) of a box in metres, the last two exclusive, with the room that a ball takes.
@@ -272,11 +274,7 @@ class PointMazeVectorEnv(BatchEnv):
         self.continuous = continuous
         self.reward_type = reward_type
         self.momentum = momentum
-        self._physics = Batch(point_model(), num_envs, n_threads)
-        self._position = self._physics.bind("qpos")
-        self._velocity = self._physics.bind("qvel")
-        self._force = self._physics.bind("ctrl")
-        self._obstacle_pos = self._physics.expand("geom_pos")[:, _N_WALLS : _N_WALLS + N_OBSTACLES, :2]
+        self._connect(n_threads)
         self._layers = np.zeros((num_envs, *pictures.shape), dtype=np.uint8)
         # 255 where floor is seen, and the layer elsewhere: to lay the layer over other pictures by bitwise operations.
         self._floor = np.zeros((num_envs, 1, IMAGE_SIZE, IMAGE_SIZE), dtype=np.uint8)
@@ -286,6 +284,30 @@ class PointMazeVectorEnv(BatchEnv):
         self._solid_counts = np.zeros((num_envs, IMAGE_SIZE + 1, IMAGE_SIZE + 1), dtype=np.int64)
         self._first_count = self._everyone[:, None] * (IMAGE_SIZE + 1) ** 2
         self._pushes = free_displacement(DIRECTIONS)
+
+    def _connect(self, n_threads: int) -> None:
+        self._physics = Batch(point_model(), self.num_envs, n_threads)
+        self._position = self._physics.bind("qpos")
+        self._velocity = self._physics.bind("qvel")
+        self._force = self._physics.bind("ctrl")
+        self._obstacle_pos = self._physics.expand("geom_pos")[:, _N_WALLS : _N_WALLS + N_OBSTACLES, :2]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For ``copy`` and ``pickle``, which know no MuJoCo batch: the numbers that it goes on from, in its place."""
+        live = ("_physics", "_position", "_velocity", "_force", "_obstacle_pos")
+        state = {name: value for name, value in self.__dict__.items() if name not in live}
+        state["n_threads"] = self._physics.nthread
+        state["obstacle_pos"] = self._obstacle_pos.copy()
+        state["simulation"] = {name: self._physics.bind(name).copy() for name in _SIMULATION_STATE}
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        n_threads, obstacle_pos, simulation = (state.pop(name) for name in ("n_threads", "obstacle_pos", "simulation"))
+        self.__dict__.update(state)
+        self._connect(n_threads)
+        self._obstacle_pos[:] = obstacle_pos
+        for name, array in simulation.items():
+            self._physics.bind(name)[:] = array
 
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
