@@ -15,7 +15,7 @@ from PIL import Image
 from sb3_abisim.benchmark import statistics
 from sb3_abisim.benchmark.__main__ import main
 from sb3_abisim.benchmark.comparison import compare, split_label
-from sb3_abisim.benchmark.figures import MINUS
+from sb3_abisim.benchmark.figures import MINUS, assign_colours
 from sb3_abisim.benchmark.report import _verdict, report
 from sb3_abisim.benchmark.runs import find_runs, read_run
 
@@ -151,6 +151,16 @@ def test_page_needs_no_other_file_and_says_how_it_was_evaluated(made: Path) -> N
     for name in ("curves", "thresholds", "splits", "aggregates", "profiles", "improvement"):
         with Image.open(made / f"{name}.png") as picture:
             assert len(picture.convert("RGB").getcolors(1 << 24)) > 10, name
+
+
+def test_a_method_has_the_same_colour_in_every_report() -> None:
+    everything = assign_colours(["abisim", "vanilla", "ssi", "acro", "curl", "beta_vae", "info_nce", "mine"])
+    assert len(set(everything.values())) == 8
+    two = assign_colours(["abisim,frozen", "ssi,frozen"])
+    assert (two["abisim,frozen"], two["ssi,frozen"]) == (everything["abisim"], everything["ssi"])
+    variants = assign_colours(["abisim=0ff2bc", "abisim=1bd228", "vanilla", "vanilla, 10,000", "ssi"])
+    assert len(set(variants.values())) == 5
+    assert (variants["vanilla"], variants["ssi"]) == (everything["vanilla"], everything["ssi"])
 
 
 def test_the_same_runs_give_the_same_files(made: Path, logs: Path, tmp_path: Path) -> None:

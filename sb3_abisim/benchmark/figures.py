@@ -1,6 +1,8 @@
 """The pictures of a report."""
 
 import io
+import itertools
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +14,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart; the reference comes first.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F")
+# Okabe and Ito's palette, which colour-blind readers can tell apart, and two more for whatever else is compared.
+METHOD_COLOURS = {
+    "abisim": "#0072B2",
+    "vanilla": "#D55E00",
+    "ssi": "#009E73",
+    "acro": "#CC79A7",
+    "curl": "#E69F00",
+    "beta_vae": "#56B4E9",
+    "info_nce": "#000000",
+}
+COLOURS = (*METHOD_COLOURS.values(), "#8C6D31", "#7F7F7F")
 GREY = "#6b7280"
 DPI = 150
 MINUS = "\N{MINUS SIGN}"
@@ -58,7 +69,7 @@ def draw(comparison: Comparison) -> dict[str, bytes]:
 
     labels = list(dict.fromkeys(label for methods in comparison.groups.values() for label in methods))
     labels.sort(key=lambda label: label != comparison.reference)
-    colours = {label: COLOURS[i % len(COLOURS)] for i, label in enumerate(labels)}
+    colours = assign_colours(labels)
     pictures = {}
     functions = {
         "curves": _curves, "thresholds": _thresholds, "splits": _splits, "aggregates": _aggregates,
@@ -74,6 +85,18 @@ def draw(comparison: Comparison) -> dict[str, bytes]:
                 plt.close(figure)
                 pictures[name] = buffer.getvalue()
     return pictures
+
+
+def assign_colours(labels: Sequence[str]) -> dict[str, str]:
+    """To each method the same colour in every report; variants of a method, and others, take what is left.
+
+    :param labels: of the methods, the reference first
+    :return: label to colour
+    """
+    methods = [re.split("[=,]", label)[0] for label in labels]
+    own = {method: METHOD_COLOURS[method] for method in methods if method in METHOD_COLOURS}
+    spare = itertools.cycle([colour for colour in COLOURS if colour not in own.values()])
+    return {label: own.pop(method, None) or next(spare) for label, method in zip(labels, methods, strict=True)}
 
 
 def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
