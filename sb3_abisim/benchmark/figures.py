@@ -96,7 +96,8 @@ def assign_colours(labels: Sequence[str]) -> dict[str, str]:
     methods = [re.split("[=,]", label)[0] for label in labels]
     own = {method: METHOD_COLOURS[method] for method in methods if method in METHOD_COLOURS}
     spare = itertools.cycle([colour for colour in COLOURS if colour not in own.values()])
-    return {label: own.pop(method, None) or next(spare) for label, method in zip(labels, methods, strict=True)}
+    pairs = zip(labels, methods, strict=True)
+    return {label: own.pop(method) if method in own else next(spare) for label, method in pairs}
 
 
 def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
