@@ -83,7 +83,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
-    """Sphinx's roles, which the docstrings share with Stable-Baselines3's, are not known to mkdocs."""
+    """Pictures lead to themselves at full size; Sphinx's roles, as in SB3's docstrings, are not known to mkdocs."""
+    html = re.sub(r'(<img[^>]* src="([^"]+)"[^>]*>)', r'<a href="\2">\1</a>', html)
     return re.sub(r":(?:class|data|func|meth|mod):(?:<code>~?)", "<code>", html)
 
 
