@@ -47,6 +47,11 @@ class EncoderExtractor(BaseFeaturesExtractor):
         self.register_buffer("initial_weights", self._flat_weights().clone())
         self._input_checked = False
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        # Copies of parameters lose it.
+        mark_encoder(self.encoder)
+
     @property
     def digest(self) -> str | None:
         """sha256 (hexadecimal) of the encoder file that the weights came from, None if they came from none."""

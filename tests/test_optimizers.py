@@ -129,6 +129,14 @@ def optimizers(model: Any) -> list[EncoderLRAdam]:
     return [optimizer for optimizer in found if optimizer is not None]
 
 
+def test_a_new_optimizer_for_a_copy_of_a_policy(path: Path) -> None:
+    model = with_rate("PPO", path, 0.5)
+    twin = copy.deepcopy(model.policy)
+    optimizer = EncoderLRAdam(twin.parameters(), lr=LR, encoder_lr_factor=0.5)
+    groups = [{p.shape for p in group["params"]} for group in optimizer.param_groups]
+    assert groups == [{p.shape for p in group["params"]} for group in model.policy.optimizer.param_groups]
+
+
 class FirstStep:
     """How far an optimizer's first step moves heads and encoder at most, in units of the learning rate."""
 
