@@ -48,7 +48,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
         self._input_checked = False
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
         # Copies of parameters lose it.
         mark_encoder(self.encoder)
 
