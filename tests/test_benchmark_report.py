@@ -104,6 +104,19 @@ def test_where_a_baseline_ends_is_a_threshold(made: Path, logs: Path) -> None:
     assert {r["threshold"] for r in compare([str(logs / "ssi")]).thresholds} == set(), "nothing to compare with"
 
 
+def test_a_baseline_may_run_for_longer(tmp_path: Path) -> None:
+    """What it reaches after the reference's last step counts, and so do all the steps in which it does not arrive."""
+    jumps = {"abisim": ([2000, 3000], 5), "ssi": ([7000, 8000], 10), "vanilla": ([99_000, 99_000], 10)}
+    for method, (at, n) in jumps.items():
+        for seed, jump in enumerate(at):
+            returns = np.where(np.array(STEPS[:n]) >= jump, -20.0, -100.0)[:, None]
+            write_run(tmp_path / method, "PointMaze-v0", method, seed, STEPS[:n], returns)
+    comparison = compare([str(tmp_path)], thresholds=[0.7])
+    found = {r["baseline"]: (r["ratio"], r["bound"], r["horizon_baseline"]) for r in comparison.thresholds}
+    assert found == {"ssi": (4500 / 9500, "", 10_000), "vanilla": (4500 / 10_000, "<=", 10_000)}
+    assert any("different numbers of steps (abisim 5,000, ssi 10,000" in note for note in comparison.notes)
+
+
 def test_final_table_stands_beside_the_papers(made: Path) -> None:
     table = {(r["env_id"], r["method"], r["mode"], r["split"]): r for r in rows(made / "final.csv")}
     row = table["PointMaze-v0", "abisim", "deterministic", "last evaluation"]

@@ -59,7 +59,7 @@ def test_share_of_wins_is_rliables_metric() -> None:
 
 
 def test_ratio_and_its_bootstrap() -> None:
-    ratio = statistics.steps_ratio(np.array([100.0, 200.0]), np.array([400.0, 400.0]), 1000)
+    ratio = statistics.steps_ratio(np.array([100.0, 200.0]), np.array([400.0, 400.0]), (1000, 1000))
     # The mean of two draws from 100 and 200 is 100, 150 or 200.
     assert (ratio.value, ratio.low, ratio.high, ratio.bound) == (0.375, 0.25, 0.5, "")
     assert ratio.reached == (1, 1)
@@ -75,14 +75,27 @@ def test_ratio_and_its_bootstrap() -> None:
     ],
 )
 def test_runs_that_never_arrive_make_a_bound(reference: list, baseline: list, bound: str, value: float) -> None:
-    ratio = statistics.steps_ratio(np.array(reference, float), np.array(baseline, float), 1000)
+    ratio = statistics.steps_ratio(np.array(reference, float), np.array(baseline, float), (1000, 1000))
+    assert ratio.bound == bound and ratio.value == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("reference", "baseline", "bound", "value"),
+    [
+        ([100, 300], [1600, np.nan], "<=", 200 / 2800),
+        ([100, np.nan], [1600, 2400], ">=", 550 / 2000),
+        ([100, np.nan], [1600, np.nan], "~", 550 / 1000),
+    ],
+)
+def test_a_longer_baseline_makes_the_bound_closer(reference: list, baseline: list, bound: str, value: float) -> None:
+    ratio = statistics.steps_ratio(np.array(reference, float), np.array(baseline, float), (1000, 4000))
     assert ratio.bound == bound and ratio.value == pytest.approx(value)
 
 
 def test_no_ratio_without_arrivals_or_interval_without_runs() -> None:
-    nobody = statistics.steps_ratio(np.full(3, np.nan), np.full(3, np.nan), 1000)
+    nobody = statistics.steps_ratio(np.full(3, np.nan), np.full(3, np.nan), (1000, 1000))
     assert np.isnan(nobody.value) and nobody.reached == (0, 0)
-    single = statistics.steps_ratio(np.array([100.0]), np.array([400.0, 300.0]), 1000)
+    single = statistics.steps_ratio(np.array([100.0]), np.array([400.0, 300.0]), (1000, 1000))
     assert single.value == pytest.approx(100 / 350) and np.isnan(single.low)
 
 

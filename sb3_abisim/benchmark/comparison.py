@@ -195,12 +195,12 @@ def _groups(all_runs: list[Run], source: str, reference: str, notes: list[str]) 
 
 
 def _note_unfinished(run: Run, curve: Curve, notes: list[str]) -> None:
-    """A run that was stopped looks like any other, and everything is compared up to its last step."""
+    """A run that was stopped looks like any other, and its method is compared up to its last step."""
     longest = int(np.diff(curve.steps, prepend=0).max())
     if curve.steps[-1] + 2 * longest < run.n_timesteps:
         notes.append(
-            f"{run.env_id}: {run.folder} ends at step {int(curve.steps[-1]):,} of {run.n_timesteps:,}, and no run is "
-            "compared beyond; let it end, or leave it out."
+            f"{run.env_id}: {run.folder} ends at step {int(curve.steps[-1]):,} of {run.n_timesteps:,}, and no "
+            "run of its method is compared beyond; let it end, or leave it out."
         )
 
 
@@ -277,7 +277,7 @@ def _threshold_rows(
     for env_id, methods in groups.items():
         if reference not in methods:
             continue
-        horizon = int(min(curve.steps[-1] for group in methods.values() for curve in group.curves))
+        horizons = {label: int(min(c.steps[-1] for c in group.curves)) for label, group in methods.items()}
         for threshold in thresholds:
             if isinstance(threshold, str):
                 if threshold not in methods:
@@ -292,22 +292,24 @@ def _threshold_rows(
                 level = first.low + threshold * (first.high - first.low)
             steps = {
                 label: np.array(
-                    [statistics.steps_to_threshold(c.steps, c.returns, level, horizon) for c in group.curves]
+                    [statistics.steps_to_threshold(c.steps, c.returns, level, horizons[label]) for c in group.curves]
                 )
                 for label, group in methods.items()
             }
             for label in methods:
                 if label == reference:
                     continue
-                ratio = statistics.steps_ratio(steps[reference], steps[label], horizon, seed)
+                pair = horizons[reference], horizons[label]
+                ratio = statistics.steps_ratio(steps[reference], steps[label], pair, seed)
                 rows.append(
                     {"env_id": env_id, "threshold": threshold, "return": level, "baseline": label,
                      "ratio": ratio.value, "low": ratio.low, "high": ratio.high, "bound": ratio.bound,
-                     "steps_reference": float(np.nan_to_num(steps[reference], nan=horizon).mean()),
-                     "steps_baseline": float(np.nan_to_num(steps[label], nan=horizon).mean()),
+                     "steps_reference": float(np.nan_to_num(steps[reference], nan=pair[0]).mean()),
+                     "steps_baseline": float(np.nan_to_num(steps[label], nan=pair[1]).mean()),
                      "reached_reference": int((~np.isnan(steps[reference])).sum()),
                      "reached_baseline": int((~np.isnan(steps[label])).sum()),
-                     "n_reference": len(steps[reference]), "n_baseline": len(steps[label]), "horizon": horizon}
+                     "n_reference": len(steps[reference]), "n_baseline": len(steps[label]),
+                     "horizon_reference": pair[0], "horizon_baseline": pair[1]}
                 )  # fmt: skip
     return rows
 

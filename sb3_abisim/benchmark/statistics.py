@@ -66,7 +66,8 @@ def steps_to_threshold(steps: NDArray[np.int64], values: Floats, threshold: floa
 class Ratio:
     """How many steps one method needs for each step of another.
 
-    :param value: ratio of the mean steps; runs that never arrived count with the horizon
+    :param value: ratio of the mean steps; runs that never arrived count with their method's horizon, or, where runs of
+        both did not, with the shorter of the two
     :param low: of the 95 % interval; NaN with a single run
     :param high: of the interval
     :param bound: "" when all runs arrived; "<=" when runs of the baseline alone did not, so that the true ratio is
@@ -81,12 +82,12 @@ class Ratio:
     reached: tuple[float, float]
 
 
-def steps_ratio(reference: Floats, baseline: Floats, horizon: int, seed: int = 0) -> Ratio:
+def steps_ratio(reference: Floats, baseline: Floats, horizons: tuple[int, int], seed: int = 0) -> Ratio:
     """Compare steps to a threshold; the interval is a percentile bootstrap over the runs of both.
 
     :param reference: steps of each run, NaN where it never arrived
     :param baseline: likewise
-    :param horizon: that those count with
+    :param horizons: how long the runs of the reference and of the baseline are
     :param seed: of the resamples
     """
     missed = bool(np.isnan(reference).any()), bool(np.isnan(baseline).any())
@@ -94,7 +95,12 @@ def steps_ratio(reference: Floats, baseline: Floats, horizon: int, seed: int = 0
     reached = float(1 - np.isnan(reference).mean()), float(1 - np.isnan(baseline).mean())
     if not any(reached):
         return Ratio(float("nan"), float("nan"), float("nan"), bound, reached)
-    a, b = (np.nan_to_num(steps, nan=horizon) for steps in (reference, baseline))
+    # Where one arrives, longer runs of the other make a closer bound; where neither does, they feign a difference.
+    limits = (min(horizons),) * 2 if all(missed) else horizons
+    a, b = (
+        np.minimum(np.nan_to_num(steps, nan=limit), limit)
+        for steps, limit in zip((reference, baseline), limits, strict=True)
+    )
     low = high = float("nan")
     if len(a) > 1 and len(b) > 1:
         rng = np.random.default_rng(seed)
