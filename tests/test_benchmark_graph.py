@@ -173,6 +173,7 @@ def test_distractors_are_evaluated_on_three_splits() -> None:
         ({"n_timesteps": 0}, "n_timesteps must be at least 1, got 0"),
         ({"algo": "sac"}, "no hyperparameters of sac for Nav2D-v0"),
         ({"params": ("sac.gamma:0.9",)}, "--params sac.gamma:0.9 is for sac, but here is only dqn, ppo"),
+        ({"params": ("env_kwargs:dict(recolour=False)",)}, "would hold for RL, but not for the data"),
         ({"pretrain_params": ("curl.n_updates:3",)}, "curl.n_updates:3 is for curl, but here is only abisim, ssi"),
         ({"params": ("gamma",)}, "name:value, got 'gamma'"),
         ({"params": ("dqn.learning_rat:1e-4",)}, "dqn has no hyperparameter 'learning_rat', only .*learning_rate"),

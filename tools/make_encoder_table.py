@@ -1,5 +1,6 @@
 """Write ``encoders/README.md`` from the cards of the shipped encoders: ``python tools/make_encoder_table.py``."""
 
+import argparse
 import json
 from pathlib import Path
 
@@ -28,6 +29,7 @@ RESULTS = {"beta_vae": ("squared_error", "kl"), "abisim": ("metric", "distance")
 
 def main() -> None:
     """Write the table."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     rows = []
     for path in sorted(ENCODERS.glob("*/*.json")):
         card = json.loads(path.read_text())

@@ -180,6 +180,12 @@ def _check_owners(plan: Plan, cells: list[Cell]) -> None:
             head, dot, _ = word.partition(".")
             if dot and head in owners and head not in used:
                 raise ValueError(f"{option} {word} is for {head}, but here is only {', '.join(sorted(used)) or 'none'}")
+    for word in plan.params:
+        if re.match(r"(\w+\.)?env_kwargs:", word) and any(cell.kind == "data" for cell in cells):
+            raise ValueError(
+                f"--params {word} would hold for RL, but not for the data that encoders are pretrained on; collect and "
+                "pretrain with the same arguments yourself, and give the files: METHOD=FILE"
+            )
 
 
 def data_cell(plan: Plan, env_id: str) -> Cell:

@@ -19,7 +19,7 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
 
     **Observation.** uint8 (3, 64, 64), RGB. Every pixel that agent, goal, obstacles or walls touch has the bytes of the
     plain PointMaze; every other pixel shows the background. An episode has one clip, drawn uniformly from the split,
-    and a start drawn uniformly from its frames. Each step shows the next frame; at its ends the clip turns round.
+    and a start drawn uniformly from its frames. Each step shows the next frame; at its ends the clip reverses.
 
     **Splits.** "train" and "eval" share no film and no photograph: pretrain and train on the one, evaluate on the
     other. "clean" shows the plain floor, for a comparison. The same seed gives the same mazes in all three.
