@@ -69,7 +69,8 @@ comparisons: setup  ## draw every curve of docs/results.md anew from the committ
 	}; \
 	for name in $(COMPARISONS); do draw $$name || exit 1; done; \
 	for name in $(TRAINING_COMPARISONS); do draw $$name --source training || exit 1; done; \
-	draw nav2d_dqn_target "$(NAV2D_VANILLA)"
+	draw nav2d_dqn_target "$(NAV2D_VANILLA)" && \
+	draw distractor_vanilla_longer benchmarks/results/comparison/distractor_finetuned_more --source training
 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
 	$(BIN)/python -m sb3_abisim.benchmark -o benchmark

@@ -8,6 +8,7 @@ releases when its holder dies, so that a kill leaves nothing to clean up by hand
 import contextlib
 import hashlib
 import os
+import secrets
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,7 +34,8 @@ def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], ob
     :raises OSError: what the system says, ``errno.ENOSPC`` for a full disk; the temporary file is removed
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}{_TEMPORARY_SUFFIX}")
+    # Random, since processes in containers that share a folder have equal numbers, and threads of one have one.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_TEMPORARY_SUFFIX}")
     try:
         with open(temporary, "wb") as file:
             if size and hasattr(os, "posix_fallocate"):

@@ -5,7 +5,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 
 from sb3_abisim.allocator import keep_freed_memory
 from sb3_abisim.extractors import find_extractors, require_weights
-from sb3_abisim.vec_env import VecEncodeObservations
+from sb3_abisim.vec_env import EncodedBox, VecEncodeObservations
 
 
 class EncoderCallback(BaseCallback):
@@ -36,7 +36,8 @@ class EncoderCallback(BaseCallback):
         if encoding is not None:
             # VecNormalize.load brings the space of the saved run, and Stable-Baselines3 compares the model's with that.
             space = self.model.observation_space
-            if space != encoding.observation_space:
+            # Of another kind where embeddings of several steps are stacked, which Stable-Baselines3 compares itself.
+            if isinstance(space, EncodedBox) and space != encoding.observation_space:
                 raise ValueError(
                     f"the model was trained on {space}, but {encoding.source} makes {encoding.observation_space}; give "
                     "the encoder file that it was trained on"

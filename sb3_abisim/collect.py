@@ -242,6 +242,7 @@ def _steps_per_shard(env: VectorEnv[Any, Any, Any], env_id: str, env_kwargs: dic
     """Steps of each copy: whole time limits, so that late stages of episodes are seen as often as early ones."""
     spec = gym.registry[env_id]
     limit = int(env_kwargs.get("max_episode_steps") or spec.max_episode_steps or 1)
+    limit = max(1, limit)  # -1 is Gymnasium's word for none; it refuses other numbers below 1
     row = math.prod(env.single_observation_space.shape or ())
     if _draws_factors(env):
         row = sum(array[0].nbytes for array in _factors(env).values())

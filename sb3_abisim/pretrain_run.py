@@ -77,7 +77,7 @@ class PretrainRun:
         self.dataset, self.output, self.config, self.seed = dataset, output, config, seed
         self.callback = callback
         self.folder = output.with_suffix(".run")
-        self.device = get_device(device)
+        self.device = _device(device)
         self.settings: dict[str, Any] = {
             "objective": objective,
             "seed": seed,
@@ -347,6 +347,18 @@ class PretrainRun:
                     del values["n_updates"]
                     output.write(dict(sorted(values.items())), dict.fromkeys(values, ()))
         return logger
+
+
+def _device(name: str) -> th.device:
+    """As in Stable-Baselines3, except that a device that is not there is an error instead of the CPU."""
+    try:
+        device = get_device(name)
+        there = name == "auto" or device.type == th.device(name).type
+    except RuntimeError as error:
+        raise ValueError(f"unknown device {name!r}: {error}") from error
+    if not there:
+        raise ValueError(f"device {name!r} is not available to this PyTorch; give --device auto or cpu")
+    return device
 
 
 def reproducing_commands(settings: dict[str, Any], config: PretrainConfig, meta: dict[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
@@ -74,6 +75,23 @@ def test_full_disk_is_found_out_before_writing(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(OSError, match="No space left"):
         write_atomic(tmp_path / "file", lambda file: pytest.fail("written"), size=3)
     assert os.listdir(tmp_path) == []
+
+
+def test_writers_of_one_process_do_not_share_a_temporary_file(tmp_path: Path) -> None:
+    """As processes in containers with a common folder, which may have one number, do not."""
+    contents = [bytes([i]) * 10 for i in range(2)]
+
+    def write(content: bytes, inner: bytes | None) -> None:
+        def both(file: BinaryIO) -> None:
+            file.write(content)
+            if inner is not None:
+                write(inner, None)
+
+        write_atomic(tmp_path / "file", both)
+
+    write(contents[0], contents[1])
+    assert (tmp_path / "file").read_bytes() == contents[0]
+    assert os.listdir(tmp_path) == ["file"]
 
 
 def test_remove_temporaries_spares_other_files(tmp_path: Path) -> None:

@@ -259,6 +259,9 @@ def test_training_episodes_as_source(tmp_path: Path) -> None:
     assert curve.steps.tolist() == STEPS
     assert curve.returns.tolist() == [-95.5 + 10 * i for i in range(10)]
     assert curve.successes is not None and curve.successes.tolist() == [0] * 5 + [1] * 5
+    (tmp_path / "logs [1]").mkdir()
+    moved = run.rename(tmp_path / "logs [1]" / run.name)
+    assert read_run(moved).training(n_points=10).returns.tolist() == curve.returns.tolist()
     main(["report", str(tmp_path), "--source", "training"])
     text = (tmp_path / "report" / "index.html").read_text()
     assert "the training episodes themselves" in text and "Evaluation is deterministic" not in text

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_abisim.callbacks import EncoderCallback
 from sb3_abisim.checkpoint import save_encoder
@@ -157,6 +157,12 @@ def test_backgrounds_are_stated(capsys: pytest.CaptureFixture[str]) -> None:
     env.fingerprint = "0123abcd"  # type: ignore[attr-defined]
     learn(PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1), 16)
     assert "Pictures of the training environment: 0123abcd\n" in capsys.readouterr().out
+
+
+def test_stacked_embeddings_are_trained_on(encoder: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    env = VecFrameStack(VecEncodeObservations(DummyVecEnv([Grid]), encoder[0]), 2)
+    learn(PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1, device="cpu"), 16)
+    assert f"Encoder of the environment: VecEncodeObservations, source {encoder[0]}" in capsys.readouterr().out
 
 
 def test_training_keeps_freed_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -244,6 +244,12 @@ def test_full_disk_is_one_message_and_resumes(
     assert tree(tmp_path / "d") == tree(tmp_path / "direct")
 
 
+def test_an_environment_made_without_a_limit(tmp_path: Path) -> None:
+    """-1 is Gymnasium's word for none."""
+    collect("PlainEnv-v0", 50, tmp_path / "d", n_envs=2, env_kwargs={"max_episode_steps": -1})
+    assert len(TransitionDataset(tmp_path / "d").valid_starts()) == 50
+
+
 def test_a_shard_does_not_depend_on_what_the_environment_did_before() -> None:
     def shard(env: gym.vector.VectorEnv, k: int) -> list[tuple[bytes, bytes, int]]:
         segments = collect_shard(env, 12, PER_SHARD, np.random.SeedSequence(0, spawn_key=(k,)))

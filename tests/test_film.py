@@ -1,5 +1,7 @@
 """Films of zoo runs."""
 
+import contextlib
+import dataclasses
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,6 +14,8 @@ from zoo_inputs import SMALL
 
 from sb3_abisim import film as film_module
 from sb3_abisim import zoo
+from sb3_abisim.benchmark.evaluate import final_model
+from sb3_abisim.benchmark.runs import read_run
 from sb3_abisim.film import MILLISECONDS, N_LAST, film, main
 
 
@@ -99,6 +103,25 @@ def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message)
         main([*words, "-o", str(tmp_path / "a.gif")])
     assert message in capsys.readouterr().err
     assert not (tmp_path / "a.gif").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"env_wrapper": "some.Wrapper"}, "env_wrapper"),
+        ({"frame_stack": 2}, "frame_stack"),
+        ({"normalize": True}, "normalize"),
+        ({"normalize": "dict(norm_reward=True)"}, "normalize"),
+        ({"vec_env_wrapper": [{"some.VecWrapper": {"n": 1}}]}, "some.VecWrapper"),
+        ({"normalize": "dict(norm_obs=False, norm_reward=True)"}, None),
+        ({"normalize": "{'norm_obs': False}"}, None),
+    ],
+)
+def test_wrappers_that_would_be_missing_are_named(run_folder, settings, named):
+    """A model would be shown other pictures, or act otherwise, than in training."""
+    run = dataclasses.replace(read_run(run_folder), settings=settings)
+    with contextlib.nullcontext() if named is None else pytest.raises(ValueError, match=f"with {named}, which is not"):
+        final_model(run)
 
 
 def test_a_run_that_goes_on_is_refused(run_folder, tmp_path):

@@ -85,6 +85,21 @@ def test_mistakes_are_found_before_the_base_is_trained(data, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ("gpu0", "unknown device 'gpu0'"),
+        pytest.param(
+            "cuda", "'cuda' is not available", marks=pytest.mark.skipif(th.cuda.is_available(), reason="CUDA is there")
+        ),
+    ],
+)
+def test_a_device_that_is_not_there_is_refused(data, tmp_path, device, message):
+    config = load_config("ssi", "Nav2D-v0", SETTINGS)
+    with pytest.raises(ValueError, match=message):
+        pretrain("ssi", data, tmp_path / "ssi.safetensors", config, device=device, progress_bar=False, verbose=0)
+
+
 def test_abisim_takes_every_base(data, tmp_path):
     for objective, k in (("acro", [1, 4]), ("info_nce", 2)):
         base = run(data, tmp_path / f"{objective}{k}.safetensors", objective, k=k)

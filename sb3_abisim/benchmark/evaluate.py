@@ -7,6 +7,7 @@ mazes.
 """
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark.runs import Run, read_run
 from sb3_abisim.checkpoint import RUN_COPY
 from sb3_abisim.frozen import fuse
-from sb3_abisim.vec_env import EncodedBox
+from sb3_abisim.vec_env import EncodedBox, VecEncodeObservations
 from sb3_abisim.zoo import DISTRACTOR_IDS
 
 FILE_NAME = "final_evaluations.npz"
@@ -60,10 +61,11 @@ def final_model(run: Run) -> BaseAlgorithm:
     """The model that a run ended with, on the CPU; it acts on pictures, whatever it was trained on.
 
     :param run: a zoo run
-    :raises ValueError: if the run has not ended
+    :raises ValueError: if the run has not ended, or if it had wrappers around its environment that are not there here
     """
     from rl_zoo3.utils import ALGOS
 
+    _check_rebuilt(run)
     path = run.folder / f"{run.env_id}.zip"
     if not path.is_file():
         raise ValueError(f"{run.folder} holds no final model ({path.name}); let the run end first")
@@ -72,6 +74,23 @@ def final_model(run: Run) -> BaseAlgorithm:
         # Trained on embeddings, and the environments show pictures.
         model = fuse(model, str(run.folder / run.env_id / RUN_COPY))
     return model
+
+
+def _check_rebuilt(run: Run) -> None:
+    """Refuse a model that saw its environment through what the environments here are made without."""
+    found = [name for name in ("env_wrapper", "frame_stack") if run.settings.get(name)]
+    # True or rl-zoo3's "dict(...)"; normalised rewards change nothing of what a model sees.
+    normalize = str(run.settings.get("normalize") or "norm_obs=False")
+    found += ["normalize"] if not re.search(r"norm_obs['\"]?\s*[=:]\s*False", normalize) else []
+    wrappers = run.settings.get("vec_env_wrapper") or []
+    for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
+        name = next(iter(wrapper)) if isinstance(wrapper, dict) else str(wrapper)
+        found += [name] if name.rpartition(".")[2] != VecEncodeObservations.__name__ else []
+    if found:
+        raise ValueError(
+            f"{run.folder} was trained with {', '.join(found)}, which is not rebuilt here; evaluate it with python -m "
+            "sb3_abisim.zoo enjoy"
+        )
 
 
 def split_kwargs(env_kwargs: dict[str, Any], split: str | None) -> dict[str, Any]:

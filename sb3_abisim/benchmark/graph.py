@@ -27,10 +27,10 @@ from sb3_abisim.pretrain_config import load_config
 from sb3_abisim.zoo import DISTRACTOR_IDS, UNTRAINED, Method, hyperparameters_file
 
 ALGOS = ("ppo", "dqn", "sac")
-# What rl-zoo3 reads besides the algorithm's own arguments, and what has a flag of its own.
+# What rl-zoo3 reads besides the algorithm's own arguments, and what has a flag of its own. Without env_wrapper and
+# frame_stack: pretraining and the final evaluation make environments that have neither.
 ZOO_PARAMS = {
-    "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "noise_std", "noise_type",
-    "normalize", "vec_env_wrapper",
+    "callback", "env_kwargs", "monitor_kwargs", "n_envs", "noise_std", "noise_type", "normalize", "vec_env_wrapper",
 }  # fmt: skip
 FLAGS = {"device": "--device", "n_timesteps": "--n-timesteps", "seed": "--seeds"}
 # The paper's Table of data: random-action transitions for pretraining.

@@ -1,6 +1,7 @@
 """Read the run folders of rl-zoo3, whoever made them, without executing anything that they hold."""
 
 import dataclasses
+import glob
 import json
 import re
 import zipfile
@@ -104,7 +105,7 @@ class Run:
             what = f"{self.folder} holds neither *.monitor.csv nor {TRAINING_CURVE}"
             raise ValueError(f"{what}; take --source evaluations, or the folder that it was exported from")
         # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
-        episodes = load_results(str(self.folder))
+        episodes = load_results(glob.escape(str(self.folder)))
         if not len(episodes):
             raise ValueError(f"no episode of {self.folder} has ended yet; try again later, or leave the run out")
         ends = episodes["l"].cumsum().to_numpy()
