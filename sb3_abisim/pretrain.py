@@ -55,7 +55,7 @@ def pretrain(
     :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
     """
     from sb3_abisim.allocator import keep_freed_memory
-    from sb3_abisim.atomic import folder_lock
+    from sb3_abisim.atomic import folder_lock, remove_temporaries
     from sb3_abisim.dataset import TransitionDataset
     from sb3_abisim.networks import make_encoder
     from sb3_abisim.pretrain_run import PretrainRun, make_objective
@@ -66,6 +66,7 @@ def pretrain(
     output = Path(output)
     if output.suffix != ".safetensors":
         raise ValueError(f"the output must end in .safetensors, got {output}")
+    _check_place_of_card(output.with_suffix(".json"))
     env_id = read_env_id(Path(data))
     config = config or load_config(objective, env_id)
     dataset = TransitionDataset(data, holdout=config.holdout)
@@ -84,8 +85,10 @@ def pretrain(
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with folder_lock(folder):
+            remove_temporaries(folder)
             run = PretrainRun(objective, dataset, output, config, base, seed, device, callback)
             if run.is_finished():
+                run.drop_checkpoints()
                 if verbose:
                     print(f"{output} is finished already; nothing to do")
                 return output
@@ -95,6 +98,17 @@ def pretrain(
         if not any(folder.iterdir()):
             folder.rmdir()
     return output
+
+
+def _check_place_of_card(path: Path) -> None:
+    """The card's name follows from the encoder's, and may be that of a file which is somebody's own."""
+    if path.exists():
+        try:
+            is_card = "curves" in json.loads(path.read_bytes())
+        except (OSError, ValueError, TypeError):
+            is_card = False
+        if not is_card:
+            raise ValueError(f"the encoder's card would replace {path}, which is none; name another output")
 
 
 def read_env_id(data: Path) -> str:

@@ -131,6 +131,11 @@ class PretrainRun:
         self.n_updates, self.rows = metadata["n_updates"], metadata["rows"]
         self._saved_at = self.n_updates
 
+    def drop_checkpoints(self) -> None:
+        """Remove what only an unfinished run needs."""
+        for checkpoint in self._checkpoints():
+            checkpoint.unlink()
+
     def _checkpoints(self) -> list[Path]:
         return sorted(self.folder.glob("checkpoint-*.safetensors"))
 
@@ -156,8 +161,7 @@ class PretrainRun:
             dataset_digest=dataset.digest,
             golden_observations=golden,
         )
-        for checkpoint in self._checkpoints():
-            checkpoint.unlink()
+        self.drop_checkpoints()
         self._warn_at_chance()
 
     def _warn_at_chance(self) -> None:

@@ -85,6 +85,24 @@ def test_mistakes_are_found_before_the_base_is_trained(data, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("content", ['{"precious": true}', "[1, 2]", "3", "not JSON"])
+def test_a_file_in_the_place_of_the_card_is_not_replaced(data, tmp_path, content):
+    (tmp_path / "config.json").write_text(content)
+    with pytest.raises(ValueError, match=r"would replace .*config\.json, which is none; name another output"):
+        run(data, tmp_path / "config.safetensors", "ssi")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+    assert (tmp_path / "config.json").read_text() == content
+
+
+def test_what_kills_left_goes(data, tmp_path):
+    output = run(data, tmp_path / "ssi.safetensors", "ssi")
+    left = [tmp_path / "ssi.run" / name for name in ("checkpoint-000000003.safetensors", ".checkpoint-1.abc.tmp")]
+    for path in left:
+        path.write_bytes(b"")
+    run(data, output, "ssi")
+    assert not any(path.exists() for path in left)
+
+
 @pytest.mark.parametrize(
     ("device", "message"),
     [
