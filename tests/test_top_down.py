@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_abisim.envs import point_maze, top_down
+from sb3_abisim.envs import point_maze, point_maze_layout, top_down
 from sb3_abisim.envs.top_down import DiscPainter
 
 SIZE = 16
@@ -187,7 +187,7 @@ def test_pictures_equal_mujocos_own_orthographic_render(seed: int, tmp_path: Pat
     theirs = _render_by_mujoco(_scene(factors["obstacles"], factors["agent"]), tmp_path).astype(int)
     ours = picture.transpose(1, 2, 0).astype(int)
     error = np.abs(ours - theirs).max(axis=-1)
-    column, row = point_maze.to_pixels(factors["agent"])
+    column, row = point_maze_layout.to_pixels(factors["agent"])
     middles = np.arange(64) + 0.5
     near_agent = np.hypot(middles[None, :] - column, middles[:, None] - row) < 1.2 + 1
     assert error[~near_agent].max() <= FLAT_TOLERANCE

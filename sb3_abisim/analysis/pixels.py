@@ -16,7 +16,8 @@ from sb3_abisim.analysis.nav2d_exact import embed
 from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, sample_episodes
 from sb3_abisim.checkpoint import EncoderFile
 from sb3_abisim.envs.backgrounds import SPLITS, Backgrounds, load_backgrounds
-from sb3_abisim.envs.point_maze import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE, ROOM_SIZE
+from sb3_abisim.envs.point_maze import ROOM_SIZE
+from sb3_abisim.envs.point_maze_layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE
 from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS
 from sb3_abisim.networks import Encoder
 

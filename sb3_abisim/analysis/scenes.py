@@ -8,11 +8,19 @@ from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import HELD_OUT_SEED
 from sb3_abisim.collect import collect_shard, make_vector_env
-from sb3_abisim.envs import point_maze, top_down
+from sb3_abisim.envs import top_down
 from sb3_abisim.envs.backgrounds import composite
 from sb3_abisim.envs.base import BatchEnv
 from sb3_abisim.envs.nav2d import SIZE
-from sb3_abisim.envs.point_maze import PIXELS_PER_METRE, ROOM_SIZE, to_pixels
+from sb3_abisim.envs.point_maze import ROOM_SIZE
+from sb3_abisim.envs.point_maze_layout import (
+    GOAL_MASK,
+    OBSTACLE_PIXELS,
+    PIXELS_PER_METRE,
+    WALL_MASK,
+    static_layer,
+    to_pixels,
+)
 from sb3_abisim.envs.scan_apartment import SEEDS
 from sb3_abisim.envs.scan_map import ScanMap
 
@@ -21,7 +29,7 @@ N_COPIES = 50
 # Points around the agent, this many cells, metres or steps in each direction.
 LOCAL_REACH = 2
 SCAN_STEP = 0.25  # m, ScanNav's step forward
-_HALF_OBSTACLE = point_maze.OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
+_HALF_OBSTACLE = OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
 
 
 @dataclass(frozen=True)
@@ -151,17 +159,17 @@ def draw_point_mazes(
     :param backgrounds: what the floor shows, uint8 (n, 3, 64, 64); None for plain floor
     :return: uint8 (n, 3, 64, 64)
     """
-    corners = np.rint(to_pixels(obstacles) - point_maze.OBSTACLE_PIXELS / 2).astype(np.int64)
-    solids = np.repeat(point_maze.WALL_MASK[None], len(agents), axis=0)
+    corners = np.rint(to_pixels(obstacles) - OBSTACLE_PIXELS / 2).astype(np.int64)
+    solids = np.repeat(WALL_MASK[None], len(agents), axis=0)
     for solid, places in zip(solids, corners.tolist(), strict=True):
         for column, row in places:
-            solid[row : row + point_maze.OBSTACLE_PIXELS, column : column + point_maze.OBSTACLE_PIXELS] = True
-    pictures = np.array([point_maze.static_layer(solid) for solid in solids])
+            solid[row : row + OBSTACLE_PIXELS, column : column + OBSTACLE_PIXELS] = True
+    pictures = np.array([static_layer(solid) for solid in solids])
     painter = top_down.DiscPainter(top_down.AGENT_RADIUS * PIXELS_PER_METRE, top_down.IMAGE_SIZE)
     centres = to_pixels(agents)
     painter.draw(pictures, centres)
     if backgrounds is None:
         return pictures
-    masks = solids | point_maze.GOAL_MASK
+    masks = solids | GOAL_MASK
     painter.mark(masks, centres)
     return composite(pictures, masks, backgrounds.copy())

@@ -10,15 +10,21 @@ from numpy.typing import NDArray
 
 from sb3_abisim.envs import top_down
 from sb3_abisim.envs.base import BatchEnv, SingleEnv, check_flags
+from sb3_abisim.envs.point_maze_layout import (
+    GOAL_MASK,
+    GOAL_RADIUS,
+    N_OBSTACLES,
+    OBSTACLE_PIXELS,
+    PIXELS_PER_METRE,
+    WALL_PIXELS,
+    draw_layout,
+    static_layer,
+    to_metres,
+    to_pixels,
+)
 from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE
 
-PIXELS_PER_METRE = 4
 ROOM_SIZE = 15.0  # m, between the walls
-WALL_PIXELS = 2
-N_OBSTACLES = 20
-OBSTACLE_PIXELS = 8
-GOAL_RADIUS = 1.0  # m
-GOAL_MARK_PIXELS = 4
 
 # The point body of gymnasium-robotics (assets/point/point.xml); a test compares the two.
 BALL_RADIUS = 0.1  # m
@@ -40,87 +46,13 @@ _FASTEST, _SLOWEST = np.array(MAX_VELOCITY), np.array(-MAX_VELOCITY)
 _N_WALLS = 4
 # What the next time step depends on; the solver begins from the last accelerations.
 _SIMULATION_STATE = ("qpos", "qvel", "qacc_warmstart")
-_CENTRE = IMAGE_SIZE // 2
 
 # The pixels (left, top, right, bottom) of a box in metres, the last two exclusive, with the room that a ball takes.
-_BOX_MARGINS = _CENTRE + PIXELS_PER_METRE * (BALL_RADIUS + _CLEARANCE) * np.array((-1, -1, 1, 1)) + (0, 0, 1, 1)
+_BOX_MARGINS = IMAGE_SIZE // 2 + PIXELS_PER_METRE * (BALL_RADIUS + _CLEARANCE) * np.array((-1, -1, 1, 1)) + (0, 0, 1, 1)
 # From them to the box's corners in a flattened table of counts; with the signs, what the box holds of those counted.
 _ROW = IMAGE_SIZE + 1
 _BOX_CORNERS = np.array([(1, 0, 1, 0), (_ROW, _ROW, 0, 0), (0, 1, 0, 1), (0, 0, _ROW, _ROW)])
 _CORNER_SIGNS = np.array((1, -1, -1, 1))
-
-
-def to_pixels(positions: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Positions (x, y) in metres, shape (..., 2), as (column, row) in pixels.
-
-    :param positions: in metres from the middle of the picture, y down
-    """
-    return positions * np.float64(PIXELS_PER_METRE) + _CENTRE
-
-
-def to_metres(pixels: NDArray[Any]) -> NDArray[np.float64]:
-    """(column, row) in pixels, shape (..., 2), as positions (x, y) in metres.
-
-    :param pixels: real numbers, shape (..., 2)
-    """
-    return (pixels - _CENTRE) / PIXELS_PER_METRE
-
-
-# The layout of an episode, computed on bitboards: bit 64 * row + column of a Python int is a pixel.
-
-_STRIDE = IMAGE_SIZE
-
-
-def _square(column: int, row: int, side: int) -> int:
-    line = ((1 << side) - 1) << column
-    return sum(line << (_STRIDE * r) for r in range(row, row + side))
-
-
-def _unpack(board: int) -> NDArray[np.bool_]:
-    """The pixels of a bitboard, shape (64, 64)."""
-    raw = np.frombuffer(board.to_bytes(IMAGE_SIZE**2 // 8, "little"), dtype=np.uint8)
-    return np.unpackbits(raw, bitorder="little").view(np.bool_).reshape(IMAGE_SIZE, IMAGE_SIZE)
-
-
-def _corner_choices() -> NDArray[np.int64]:
-    """Every allowed (column, row) of an obstacle's top left pixel."""
-    corners = np.arange(WALL_PIXELS, IMAGE_SIZE - WALL_PIXELS - OBSTACLE_PIXELS + 1)
-    reach = int(GOAL_RADIUS * PIXELS_PER_METRE)
-    at_goal = (corners > _CENTRE - reach - OBSTACLE_PIXELS) & (corners < _CENTRE + reach)
-    return corners[np.argwhere(~(at_goal[:, None] & at_goal))]
-
-
-def _start_blocks() -> int:
-    """The 2 x 2 blocks around whose centre no position within half a pixel per axis is at the goal."""
-    offset = np.maximum(np.abs(np.arange(IMAGE_SIZE) + 1 - _CENTRE) - 0.5, 0.0)
-    outside = np.hypot(offset[:, None], offset) > GOAL_RADIUS * PIXELS_PER_METRE
-    return int.from_bytes(np.packbits(outside, bitorder="little").tobytes(), "little")
-
-
-_OBSTACLE = _square(0, 0, OBSTACLE_PIXELS)
-_FULL = (1 << IMAGE_SIZE**2) - 1
-_WALLS = _FULL & ~_square(WALL_PIXELS, WALL_PIXELS, IMAGE_SIZE - 2 * WALL_PIXELS)
-# A corridor is made of 2 x 2 pixels of free floor, named by their top left one; this one is the goal's.
-_GOAL_BLOCK = _square(_CENTRE - 1, _CENTRE - 1, 1)
-_CORNERS = _corner_choices()
-_START_BLOCKS = _start_blocks()
-
-WALL_MASK = _unpack(_WALLS)
-GOAL_MASK = _unpack(_square(_CENTRE - GOAL_MARK_PIXELS // 2, _CENTRE - GOAL_MARK_PIXELS // 2, GOAL_MARK_PIXELS))
-_EMPTY_LAYER = top_down.floor(IMAGE_SIZE)
-top_down.paint(_EMPTY_LAYER, WALL_MASK, top_down.WALL)
-top_down.paint(_EMPTY_LAYER, GOAL_MASK, top_down.GOAL)
-
-
-def _connected(blocks: int, start: int, goal: int) -> bool:
-    """Whether shifts by one pixel within ``blocks`` lead from ``start`` to ``goal``."""
-    reached = goal & blocks
-    while not reached & start:
-        grown = (reached | reached << 1 | reached >> 1 | reached << _STRIDE | reached >> _STRIDE) & blocks
-        if grown == reached:
-            return False
-        reached = grown
-    return True
 
 
 def free_displacement(forces: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
@@ -146,40 +78,6 @@ _N_UNCLIPPED = int(_SAFE_VELOCITY / _PUSH)
 # Of a ball pushed with full force, after 0 to SUBSTEPS time steps without the clip.
 _SPEEDS = _PUSH * (1 - _DECAY ** np.arange(SUBSTEPS + 1)) / (1 - _DECAY)
 _DISTANCES = TIMESTEP * np.cumsum(_SPEEDS)
-
-
-def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], int, NDArray[np.float64]]:
-    """Draw the obstacles and the start of an episode, until a corridor 0.5 m wide joins start and goal.
-
-    :param generator: the environment's own
-    :return: (column, row) of the obstacles' top left pixels, shape (20, 2); the bitboard of obstacles and walls; the
-        start (x, y) in metres
-    """
-    while True:
-        corners = _CORNERS[generator.integers(len(_CORNERS), size=N_OBSTACLES)]
-        occupied = _WALLS
-        for column, row in corners.tolist():
-            occupied |= _OBSTACLE << (_STRIDE * row + column)
-        free = _FULL & ~occupied
-        blocks = free & free >> 1 & free >> _STRIDE & free >> (_STRIDE + 1)
-        choices = np.flatnonzero(_unpack(blocks & _START_BLOCKS))
-        if not len(choices):
-            continue
-        block = int(choices[generator.integers(len(choices))])
-        jitter = generator.uniform(-0.5, 0.5, size=2)
-        if _connected(blocks, 1 << block, _GOAL_BLOCK):
-            row, column = divmod(block, _STRIDE)
-            return corners, occupied, to_metres(np.array([column + 1, row + 1]) + jitter)
-
-
-def static_layer(solid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The picture without agent, (3, 64, 64).
-
-    :param solid: where walls and obstacles are, (64, 64)
-    """
-    layer = _EMPTY_LAYER.copy()
-    top_down.paint(layer, solid & ~WALL_MASK, top_down.OBSTACLE)
-    return layer
 
 
 def point_model() -> mujoco.MjModel:
@@ -312,10 +210,9 @@ class PointMazeVectorEnv(BatchEnv):
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i in indices:
-            corners, occupied, start = draw_layout(self._generators[i])
+            corners, solid, start = draw_layout(self._generators[i])
             self._obstacle_pos[i] = to_metres(corners + OBSTACLE_PIXELS / 2)
             self._position[i] = start
-            solid = _unpack(occupied)
             self._solid_counts[i, 1:, 1:] = solid.cumsum(axis=0).cumsum(axis=1)
             self._layers[i] = static_layer(solid)
             self._floor[i] = np.where(solid | GOAL_MASK, 0, 255)
