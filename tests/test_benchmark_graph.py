@@ -174,6 +174,8 @@ def test_distractors_are_evaluated_on_three_splits() -> None:
         ({"algo": "sac"}, "no hyperparameters of sac for Nav2D-v0"),
         ({"params": ("sac.gamma:0.9",)}, "--params sac.gamma:0.9 is for sac, but here is only dqn, ppo"),
         ({"params": ("env_kwargs:dict(recolour=False)",)}, "would hold for RL, but not for the data"),
+        ({"params": ("frame_stack:2",)}, "dqn has no hyperparameter 'frame_stack'"),
+        ({"params": ("ppo.normalize:True",)}, "evaluation is made without normalize; .* --final-episodes 0"),
         ({"pretrain_params": ("curl.n_updates:3",)}, "curl.n_updates:3 is for curl, but here is only abisim, ssi"),
         ({"params": ("gamma",)}, "name:value, got 'gamma'"),
         ({"params": ("dqn.learning_rat:1e-4",)}, "dqn has no hyperparameter 'learning_rat', only .*learning_rate"),

@@ -8,6 +8,7 @@ mazes.
 
 import io
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,12 @@ def final_model(run: Run) -> BaseAlgorithm:
     """
     from rl_zoo3.utils import ALGOS
 
-    _check_rebuilt(run)
+    missing = not_rebuilt(run.settings)
+    if missing:
+        raise ValueError(
+            f"{run.folder} was trained with {', '.join(missing)}, which is not rebuilt here; look at it with python -m "
+            "sb3_abisim.zoo enjoy"
+        )
     path = run.folder / f"{run.env_id}.zip"
     if not path.is_file():
         raise ValueError(f"{run.folder} holds no final model ({path.name}); let the run end first")
@@ -76,21 +82,21 @@ def final_model(run: Run) -> BaseAlgorithm:
     return model
 
 
-def _check_rebuilt(run: Run) -> None:
-    """Refuse a model that saw its environment through what the environments here are made without."""
-    found = [name for name in ("env_wrapper", "frame_stack") if run.settings.get(name)]
+def not_rebuilt(settings: Mapping[str, Any]) -> list[str]:
+    """What a model saw its environment through in training, and the environments here are made without.
+
+    :param settings: of the zoo
+    :return: names of wrappers; empty where the final evaluation is as training was
+    """
+    found = [name for name in ("env_wrapper", "frame_stack") if settings.get(name)]
     # True or rl-zoo3's "dict(...)"; normalised rewards change nothing of what a model sees.
-    normalize = str(run.settings.get("normalize") or "norm_obs=False")
+    normalize = str(settings.get("normalize") or "norm_obs=False")
     found += ["normalize"] if not re.search(r"norm_obs['\"]?\s*[=:]\s*False", normalize) else []
-    wrappers = run.settings.get("vec_env_wrapper") or []
+    wrappers = settings.get("vec_env_wrapper") or []
     for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
         name = next(iter(wrapper)) if isinstance(wrapper, dict) else str(wrapper)
         found += [name] if name.rpartition(".")[2] != VecEncodeObservations.__name__ else []
-    if found:
-        raise ValueError(
-            f"{run.folder} was trained with {', '.join(found)}, which is not rebuilt here; evaluate it with python -m "
-            "sb3_abisim.zoo enjoy"
-        )
+    return found
 
 
 def split_kwargs(env_kwargs: dict[str, Any], split: str | None) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import stable_baselines3
 import yaml
 
 from sb3_abisim._version import __version__
-from sb3_abisim.benchmark.evaluate import SPLITS
+from sb3_abisim.benchmark.evaluate import SPLITS, not_rebuilt
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.pretrain import OBJECTIVE_NAMES, parse_overrides
@@ -237,6 +237,12 @@ def run_cell(plan: Plan, env_id: str, method: Method, seed: int, encoder_seed: i
     given = dict(_name_and_value(word) for word in words)
     _check_params(algo, given)
     method.hyperparameters(entry, given)
+    missing = not_rebuilt(given) if plan.final_episodes else []
+    if missing:
+        raise ValueError(
+            f"the final evaluation is made without {', '.join(missing)}; leave it out of --params, or give "
+            "--final-episodes 0"
+        )
     n = plan.n_timesteps or int(entry["n_timesteps"])
     eval_freq = plan.eval_freq or min(PAPER_EVAL_FREQ, max(n // 100, 1))
     inputs: tuple[Cell, ...] = ()
