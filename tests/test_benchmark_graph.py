@@ -163,6 +163,18 @@ def test_distractors_are_evaluated_on_three_splits() -> None:
 
 
 @pytest.mark.parametrize(
+    "changes",
+    [
+        {"methods": ("abisim=Nav2D-v0/abisim", "vanilla"), "params": ("env_kwargs:dict(max_episode_steps=20)",)},
+        {"params": ("ppo.normalize:True",), "final_episodes": 0},
+    ],
+)
+def test_settings_that_nothing_else_would_miss(changes: dict[str, object]) -> None:
+    """Arguments of environments where nothing is pretrained, and wrappers where no final evaluation is made."""
+    assert build(dataclasses.replace(PLAN, **{"env_ids": ("Nav2D-v0",), "algo": "ppo", **changes}))
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"methods": ("abisym",)}, "unknown method 'abisym'"),

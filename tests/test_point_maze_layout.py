@@ -1,6 +1,7 @@
 """PointMaze's layouts against a plain flood fill."""
 
 import numpy as np
+import pytest
 from point_maze_inputs import solid_pixels
 
 from sb3_abisim.envs import point_maze_layout
@@ -54,3 +55,11 @@ def test_blocked_layouts_are_rejected_by_the_flood_fill() -> None:
         start = 1 << (5 * 64 + 5)
         assert point_maze_layout._connected(blocks, start, point_maze_layout._GOAL_BLOCK) is expected
         assert reachable(ring | solid_pixels(np.zeros((0, 2))))[5, 5] == expected
+
+
+@pytest.mark.parametrize("seed", [217, 408, 419, 469])
+def test_blocked_layouts_are_drawn_again(seed: int) -> None:
+    """One in a hundred is; the first of each of these seeds."""
+    _, solid, start = point_maze_layout.draw_layout(np.random.default_rng(seed))
+    column, row = point_maze_layout.to_pixels(start)
+    assert reachable(solid)[round(row) - 1, round(column) - 1]
