@@ -279,6 +279,36 @@ def require_weights(model: BaseAlgorithm) -> None:
             extractor.require_weights()
 
 
+def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> None:
+    """Refuse a model whose extractors are not those that ``policy_kwargs`` would build.
+
+    An encoder file that is not there is taken for the model's: a saved model is complete without it.
+
+    :param model: an SB3 model
+    :param policy_kwargs: as for a new model
+    :raises ValueError: with both sides
+    """
+    asked_class = policy_kwargs.get("features_extractor_class")
+    kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
+    here, digest, absent = "none of our extractors", None, False
+    if isinstance(asked_class, type) and issubclass(asked_class, EncoderExtractor):
+        if issubclass(asked_class, PretrainedExtractor):
+            try:
+                digest = load_encoder(kwargs["encoder"]).digest
+            except EncoderNotFoundError:
+                absent = True
+        here = _name(asked_class, bool(kwargs.get("freeze", False)), digest)
+    extractors = [extractor for _, extractor in find_extractors(model.policy)]
+    there = {_name(type(each), each.frozen, None if absent else each.digest) for each in extractors}
+    there = there or {"none of our extractors"}
+    if there != {here}:
+        raise ValueError(f"it was trained with {' and '.join(sorted(there))}, not with {here}")
+
+
+def _name(extractor: type[EncoderExtractor], frozen: bool, digest: str | None) -> str:
+    return extractor.__name__ + f", digest {digest}" * (digest is not None) + ", frozen" * frozen
+
+
 def _check_space(observation_space: gym.Space[Any]) -> None:
     if isinstance(observation_space, spaces.Dict):
         raise ValueError(

@@ -164,6 +164,7 @@ def install() -> None:
     manager_class.read_hyperparameters = _reader(manager_class.read_hyperparameters, zoo_folder)
     manager_class.hyperparameters_optimization = _optimizer(manager_class.hyperparameters_optimization)
     manager_class._save_config = _config_saver(manager_class._save_config)
+    manager_class._load_pretrained_agent = _agent_loader(manager_class._load_pretrained_agent)
     utils = importlib.import_module("rl_zoo3.utils")
     for name, wrap in (("create_test_env", _test_env_maker), ("get_saved_hyperparams", _saved_reader)):
         plain = getattr(utils, name)
@@ -216,8 +217,6 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = original(self)
         _check_embeddings(hyperparams)
-        if self.continue_training:
-            _check_continued(Path(self.trained_agent), env_id, self.algo, saved_hyperparams)
         if hyperparams.get("n_envs", 1) > 1 and "env_wrapper" not in hyperparams:
             self.vec_env_class = _in_lockstep(self.vec_env_class)
         # Hyperparameters are selected on the training clips, so that evaluation clips stay unseen.
@@ -239,15 +238,21 @@ def _check_embeddings(hyperparams: dict[str, Any]) -> None:
         )
 
 
-def _check_continued(agent: Path, env_id: str, algo: str, hyperparams: dict[str, Any]) -> None:
-    """Refuse ``-i`` with another method: rl-zoo3 keeps the model's policy, and would record the other method."""
-    runs = importlib.import_module("sb3_abisim.benchmark.runs")
-    config = agent.parent / env_id / "config.yml"
-    if not config.is_file():
-        return
-    there, here = (runs.method_label(values, algo) for values in (runs.read_yaml(config), hyperparams))
-    if there != here:
-        raise ValueError(f"{agent} was trained with {there}, not {here}; give the same --conf-file, as {config} has it")
+def _agent_loader(original: Callable[..., Any]) -> Callable[..., Any]:
+    """Refuse ``-i`` with another extractor: rl-zoo3 keeps the model's policy, and would record the one asked for."""
+
+    @functools.wraps(original)
+    def _load_pretrained_agent(self: Any, hyperparams: dict[str, Any], env: Any) -> Any:
+        asked = hyperparams.get("policy_kwargs") or {}
+        model = original(self, hyperparams, env)
+        try:
+            importlib.import_module("sb3_abisim.extractors").check_trained_with(model, asked)
+        except ValueError as error:
+            env.close()
+            raise ValueError(f"cannot continue {self.trained_agent}: {error}; give the same --conf-file") from error
+        return model
+
+    return _load_pretrained_agent
 
 
 def _normalizes_observations(normalize: Any) -> bool:

@@ -234,18 +234,39 @@ def test_mistakes_are_refused(manager: Any) -> None:
         manager("ppo", "CartPole-v1", "abisim=mine.safetensors").read_hyperparameters()
 
 
-def test_a_run_goes_on_with_its_own_method_or_not_at_all(manager: Any, tmp_path: Path) -> None:
-    first = manager("ppo", "Nav2D-v0", "ssi")
-    first.params_path = str(tmp_path / "Nav2D-v0")
-    Path(first.params_path).mkdir()
-    first.args = argparse.Namespace()
-    first._save_config(first.read_hyperparameters()[1])
-    (tmp_path / "Nav2D-v0.zip").touch()
-    agent = str(tmp_path / "Nav2D-v0.zip")
-    manager("ppo", "Nav2D-v0", "ssi", trained_agent=agent).read_hyperparameters()
-    for config, here in ((None, "abisim"), ("ssi,frozen", "ssi,frozen"), ("acro", "acro")):
-        with pytest.raises(ValueError, match=f"was trained with ssi, not {here}; give the same --conf-file"):
-            manager("ppo", "Nav2D-v0", config, trained_agent=agent).read_hyperparameters()
+def test_a_run_goes_on_with_its_own_encoder_or_not_at_all(manager: Any, tmp_path: Path) -> None:
+    small = {"n_envs": 2, "n_steps": 8, "batch_size": 8}
+    digest, other = (write_encoder(tmp_path / f"{name}.safetensors", "Nav2D-v0", "ssi") for name in ("mine", "other"))
+    write_encoder(tmp_path / "acro.safetensors", "Nav2D-v0", "acro")
+    assert digest != other
+
+    def experiment(config: str, agent: str = "") -> Any:
+        made = manager("ppo", "Nav2D-v0", config, hyperparams=dict(small), trained_agent=agent, eval_freq=-1)
+        made.args = argparse.Namespace()
+        model = made.setup_experiment()[0]
+        model.env.close()
+        return model
+
+    agent, mine = str(tmp_path / "agent.zip"), f"ssi={tmp_path / 'mine.safetensors'}"
+    experiment(mine).save(agent)
+    assert experiment(mine, agent).policy.features_extractor.digest == digest
+    written = set(tmp_path.glob("**/config.yml"))
+    for config, here in (
+        (f"acro={tmp_path / 'acro.safetensors'}", r"ACROExtractor, digest \w{64}"),
+        (f"ssi={tmp_path / 'other.safetensors'}", f"SSIExtractor, digest {other}"),
+        ("vanilla", "VanillaExtractor"),
+    ):
+        with pytest.raises(
+            ValueError, match=f"trained with SSIExtractor, digest {digest}, not with {here}; give the same"
+        ):
+            experiment(config, agent)
+    assert set(tmp_path.glob("**/config.yml")) == written
+    # The model has the weights itself.
+    (tmp_path / "mine.safetensors").unlink()
+    assert experiment(mine, agent).policy.features_extractor.digest == digest
+    experiment("vanilla").save(agent)
+    with pytest.raises(ValueError, match="was trained with VanillaExtractor, not with SSIExtractor"):
+        experiment(mine, agent)
 
 
 def test_an_own_environment_with_normalised_embeddings_is_refused(manager: Any, tmp_path: Path) -> None:
