@@ -210,9 +210,15 @@ def make_vector_env(env_id: str, n_envs: int, env_kwargs: dict[str, Any]) -> Vec
         if _is_batch_env(spec):
             return gym.make_vec(env_id, n_envs, "vector_entry_point", **env_kwargs)
         same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
-        return gym.make_vec(env_id, n_envs, "sync", vector_kwargs=same_step, **env_kwargs)
+        wrappers = (_copy_observations,)
+        return gym.make_vec(env_id, n_envs, "sync", vector_kwargs=same_step, wrappers=wrappers, **env_kwargs)
     except (TypeError, gym.error.Error) as error:
         raise ValueError(f"cannot make {env_id} with {env_kwargs}: {error}") from error
+
+
+def _copy_observations(env: gym.Env[Any, Any]) -> gym.Wrapper[Any, Any, Any, Any]:
+    """For environments that draw into the array that they returned before: its last frame would be the next first."""
+    return gym.wrappers.TransformObservation(env, np.copy, env.observation_space)
 
 
 def _is_batch_env(spec: gym.envs.registration.EnvSpec) -> bool:

@@ -375,9 +375,9 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 def _repair(path: Path, meta: dict[str, Any]) -> str:
     if meta["source"] is not None:
-        return f"import it again from Minari ({meta['source']})"
+        return f"remove {path} and import it again from Minari ({meta['source']})"
     return (
         "run the command that collected it again, which collects damaged shards anew: python -m sb3_abisim.collect "
-        f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} -o {path}"
-        + ("" if not meta["env_kwargs"] else " with its --env-kwargs")
+        f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} "
+        f"-o {path.absolute()}" + ("" if not meta["env_kwargs"] else " with its --env-kwargs")
     )

@@ -87,13 +87,18 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--algo", choices=sorted(ALGOS), required=True, help="algorithm, by rl-zoo3's name")
     parser.add_argument("-e", "--encoder", help="encoder file (default: the copy in the zoo's run folder)")
     args = parser.parse_args(argv)
+    if not args.model.is_file():
+        parser.error(f"there is no model {args.model}; give the zip in the folder of a run that has ended")
     encoder = args.encoder
     if encoder is None:
         copies = sorted(args.model.parent.glob(f"*/{RUN_COPY}"))
         if len(copies) != 1:
             parser.error(f"{args.model.parent} holds {len(copies)} encoder files */{RUN_COPY}; give --encoder")
         encoder = str(copies[0])
-    fuse(ALGOS[args.algo].load(args.model, device="cpu"), encoder).save(args.output)
+    try:
+        fuse(ALGOS[args.algo].load(args.model, device="cpu"), encoder).save(args.output)
+    except (ValueError, FileNotFoundError) as error:
+        parser.error(str(error))
     print(f"Wrote {args.output}, a model that acts on pictures")
 
 

@@ -110,7 +110,7 @@ def import_dataset(dataset_id: str, folder: str | Path) -> str:
     channels_last = identity["source"]["channels_last"]
     with open_writer(folder, identity) as writer:
         if writer.is_finished:
-            raise ValueError(f"{folder} already holds this dataset; name a new folder")
+            raise ValueError(f"{folder} already holds this dataset; name a new folder, or remove it to import it again")
         n_shards, content = 0, hashlib.sha256()
         episodes = storage.get_episodes(range(storage.total_episodes))
         for group in _grouped(_hashed((_segment(e, identity, channels_last) for e in episodes), content)):

@@ -199,7 +199,8 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     if name not in ENCODERS:
         raise ValueError(f"unknown encoder network {name!r}; known are {sorted(ENCODERS)}")
     try:
-        encoder = ENCODERS[name](**kwargs)
+        # SB3 turns pictures into float32, whatever torch's default is.
+        encoder = ENCODERS[name](**kwargs).float()
     except TypeError as error:
         raise ValueError(f"{name} does not take these arguments: {error}") from error
     if shape != encoder.input_shape:

@@ -19,6 +19,7 @@ import yaml
 from sb3_abisim.pretrain_config import PretrainConfig, load_config
 
 if TYPE_CHECKING:
+    from sb3_abisim.dataset import TransitionDataset
     from sb3_abisim.pretrain_run import Callback
 
 OBJECTIVE_NAMES = ("ssi", "acro", "beta_vae", "curl", "info_nce", "abisim")
@@ -62,6 +63,8 @@ def pretrain(
 
     if objective not in OBJECTIVE_NAMES:
         raise ValueError(f"unknown objective {objective!r}; known are {', '.join(OBJECTIVE_NAMES)}")
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
     keep_freed_memory()
     output = Path(output)
     if output.suffix != ".safetensors":
@@ -70,6 +73,7 @@ def pretrain(
     env_id = read_env_id(Path(data))
     config = config or load_config(objective, env_id)
     dataset = TransitionDataset(data, holdout=config.holdout)
+    _check_parts(dataset, config)
     if objective == "abisim" and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
         # Mistakes in its own settings are found before the base is trained.
@@ -98,6 +102,21 @@ def pretrain(
         if not any(folder.iterdir()):
             folder.rmdir()
     return output
+
+
+def _check_parts(dataset: "TransitionDataset", config: PretrainConfig) -> None:
+    n = len(dataset.pairs(config.k, "train")[0])
+    if n < config.batch_size:
+        raise ValueError(
+            f"{dataset.path} has {n} transitions to train on, too few for a batch of {config.batch_size}; collect more "
+            "or set a smaller batch_size"
+        )
+    if config.holdout:
+        try:
+            dataset.pairs(config.k, "test")
+        except ValueError as error:
+            what = f"no segment held out of {dataset.path} (holdout {config.holdout}) has a transition of k steps"
+            raise ValueError(f"{what}; collect more transitions, or set holdout:0") from error
 
 
 def _check_place_of_card(path: Path) -> None:

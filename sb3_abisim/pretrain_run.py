@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import get_device
 from tqdm import tqdm
 
 from sb3_abisim.atomic import write_atomic
-from sb3_abisim.checkpoint import load_encoder, save_encoder
+from sb3_abisim.checkpoint import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.dataset import Part, TransitionBatch, TransitionDataset
 from sb3_abisim.networks import Encoder, make_encoder
 from sb3_abisim.objectives import OBJECTIVES, Objective, TensorBatch
@@ -106,11 +106,15 @@ class PretrainRun:
     def is_finished(self) -> bool:
         """Whether the encoder file is there, made with the same settings.
 
-        :raises ValueError: if it was made with others
+        :raises ValueError: if it was made with others, or is damaged
         """
         if not self.output.exists():
             return False
-        _refuse_other_settings(self.output, load_encoder(str(self.output)).contract["settings"], self.settings)
+        try:
+            settings = load_encoder(self.output).contract["settings"]
+        except EncoderFileError as error:
+            raise ValueError(f"{error}. To have it written again, remove it first") from error
+        _refuse_other_settings(self.output, settings, self.settings)
         return True
 
     def save(self) -> None:
@@ -274,11 +278,6 @@ class PretrainRun:
         """The batches from the present position to the end; a position is (epoch, batch within it)."""
         config = self.config
         per_epoch = len(self.dataset.pairs(config.k, "train")[0]) // config.batch_size
-        if per_epoch == 0:
-            raise ValueError(
-                f"the dataset has too few transitions for a batch of {config.batch_size}; "
-                "collect more or set a smaller batch_size"
-            )
         while self.n_updates < config.n_updates:
             epoch, start = divmod(self.n_updates, per_epoch)
             for batch in self._pass(config.batch_size, "train", epoch, start):

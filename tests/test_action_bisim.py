@@ -275,6 +275,7 @@ def test_converges_to_the_metric_of_a_chain(expectation):
     [
         ({"c": 1.0}, "c must lie"),
         ({"n_pairs": 0}, "n_pairs"),
+        ({"n_pairs": 8.0}, "n_pairs must be a whole number of at least 1, got 8.0"),
         ({"l1_penalty": math.nan}, "l1_penalty"),
         ({"c": -0.1}, "c must lie"),
         ({"tau": 0.0}, "tau"),

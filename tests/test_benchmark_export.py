@@ -117,6 +117,7 @@ def test_nothing_of_this_machine(original: Path, copy: Path) -> None:
 def test_without_folders(tmp_path: Path) -> None:
     assert without_folders(f"abisim={tmp_path}/a/b.zip,frozen", tmp_path) == "abisim=a/b.zip,frozen"
     assert without_folders("{'encoder': '/a/b c/d.zip'} /e/f.g", tmp_path) == "{'encoder': 'b c/d.zip'} f.g"
+    assert without_folders(r'"/a/M\xFCller/b.zip" "\/a/M\u00fcller/\u00fcb.zip"', tmp_path) == r'"b.zip" "\\u00fcb.zip"'
     untouched = "runs/a/b https://c.d/e !!python/object/apply:f 1 / 2 Nav2D-v0/abisim ../up ~/home"
     assert without_folders(untouched, tmp_path) == untouched
 
@@ -163,4 +164,19 @@ def test_plain_zoo_logs_and_refusals(tmp_path: Path, copy: Path) -> None:
     np.savez(run / "evaluations.npz", timesteps=np.array([{}], dtype=object))
     with pytest.raises(ValueError, match="allow_pickle=False"):
         export(tmp_path / "logs", tmp_path / "pickled")
-    assert not (tmp_path / "pickled").exists()
+    assert not list(tmp_path.glob("*pickled*"))
+
+
+def test_folders_with_spaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a command without quotes only what is known tells where such a path ends."""
+    here = tmp_path / "my home" / "work"
+    here.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    assert without_folders(f"-f {here}/logs {here}/e.zip", tmp_path / "logs") == "-f logs e.zip"
+
+
+def test_a_run_in_which_no_episode_ended(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "logs", "PointMaze-v0", "ssi", 0, STEPS, np.zeros((len(STEPS), 2)))
+    (run / "0.monitor.csv").write_text('#{"t_start": 0.0}\nr,l,t,is_success\n')
+    (copied,) = find_runs(export(tmp_path / "logs", tmp_path / "copy"))
+    assert len(copied.evaluations().steps) == len(STEPS) and not (copied.folder / "training.npz").exists()

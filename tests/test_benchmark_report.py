@@ -236,6 +236,8 @@ def test_folders_with_an_equals_sign(tmp_path: Path) -> None:
     assert split_label(f"c=half={folder}") == ("c=half", str(folder))
     assert split_label("a=nowhere=b") == ("a", "nowhere=b")
     assert list(compare([f"mine={folder}"]).groups["PointMaze-v0"]) == ["mine"]
+    with pytest.raises(ValueError, match="Matplotlib hides what is called '_mine'"):
+        compare([f"_mine={folder}"])
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"nonsense"])

@@ -187,6 +187,7 @@ def test_a_trial_that_fails_is_no_end(
     ("words", "message"),
     [
         (["--space", "c"], "a part of the search space is"),
+        (["--space", "holdout=0.5..1.5"], "holdout must lie in .* got 1.5"),
         (["--space", "no_setting=1..2"], "unknown pretraining setting no_setting"),
         (["--space", *SPACE, "--method", "vanilla"], "a sweep pretrains one of ssi, .* got 'vanilla'"),
         (["--space", *SPACE, "--method", "abisim=FILE"], "a sweep pretrains one of ssi, .* got 'abisim=FILE'"),

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import gymnasium as gym
-import index_env  # noqa: F401  registers ids
+import index_env
 import numpy as np
 import pytest
 
@@ -394,3 +394,23 @@ def test_shards_too_large_for_memory_are_refused(tmp_path: Path, monkeypatch: py
 def test_torch_is_not_imported() -> None:
     code = "import sys, sb3_abisim.collect, sb3_abisim.dataset; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], env=CHILD_ENV).returncode == 0
+
+
+def test_an_environment_that_draws_into_what_it_returned(tmp_path: Path) -> None:
+    """The last frame of an episode would else be the first of the next."""
+
+    class BufferEnv(index_env.PlainEnv):
+        def _observe(self) -> np.ndarray:
+            self.buffer = getattr(self, "buffer", np.empty(index_env.SHAPE, np.uint8))
+            self.buffer[:] = super()._observe()
+            return self.buffer
+
+    limit = index_env.LIMIT
+    gym.register("BufferEnv-v0", entry_point=BufferEnv, max_episode_steps=limit, disable_env_checker=True)
+    frames = []
+    for name in ("BufferEnv-v0", "PlainEnv-v0"):
+        collect(name, 60, tmp_path / name, n_envs=2)
+        dataset = TransitionDataset(tmp_path / name)
+        frames.append(dataset.frames(np.arange(dataset.n_frames)))
+    assert (dataset.ends > 0).sum() > 8
+    np.testing.assert_array_equal(*frames)

@@ -14,8 +14,10 @@ from zoo_inputs import SMALL
 
 from sb3_abisim import film as film_module
 from sb3_abisim import zoo
+from sb3_abisim.benchmark.__main__ import main as benchmark
 from sb3_abisim.benchmark.evaluate import final_model
-from sb3_abisim.benchmark.runs import read_run
+from sb3_abisim.benchmark.export import export
+from sb3_abisim.benchmark.runs import find_runs, read_run
 from sb3_abisim.film import MILLISECONDS, N_LAST, film, main
 
 
@@ -139,3 +141,29 @@ def test_a_folder_that_is_not_there_is_told_before_filming(tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         main([str(tmp_path / "run"), "-o", str(tmp_path / "absent" / "a.gif")])
     assert stopped.value.code == 2 and "there is no folder" in capsys.readouterr().err
+
+
+def test_an_environment_in_a_namespace(tmp_path, monkeypatch, capsys):
+    """The zoo turns the slash of its id into a dash wherever it names files."""
+    gym.register("toy/Grid-v0", entry_point=gym.spec("Nav2D-v0").entry_point, max_episode_steps=9)
+    try:
+        settings = "policy: CnnPolicy, n_timesteps: 64, n_envs: 2, n_steps: 32, batch_size: 32"
+        extractor = "dict(features_extractor_class=get_class_by_name('sb3_abisim.extractors.VanillaExtractor'))"
+        (tmp_path / "own.yml").write_text(f'toy/Grid-v0: {{{settings}, policy_kwargs: "{extractor}"}}')
+        words = ["--algo", "ppo", "--env", "toy/Grid-v0", "-f", str(tmp_path / "logs"), "--eval-freq", "-1"]
+        monkeypatch.setattr("sys.argv", [])
+        zoo.main(["train", *words, "--conf-file", str(tmp_path / "own.yml"), "--num-threads", "1"])
+        run = tmp_path / "logs" / "ppo" / "toy-Grid-v0_1"
+        assert (read_run(run).env_id, read_run(run).env_name) == ("toy/Grid-v0", "toy-Grid-v0")
+        film(run, tmp_path / "a.gif", n_episodes=1)
+        benchmark(["evaluate", str(run), "--episodes", "2", "--gym-packages", "sb3_abisim"])
+        (copied,) = find_runs(export(tmp_path / "logs", tmp_path / "copy"))
+        assert copied.final()["sampled/standard/results"].shape == (2,) and copied.command
+    finally:
+        del gym.registry["toy/Grid-v0"]
+    with pytest.raises(SystemExit):
+        benchmark(["evaluate", str(run)])
+    message = (
+        "was trained in toy/Grid-v0, which is not registered here; give the module that registers it with --gym-pack"
+    )
+    assert message in capsys.readouterr().err

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_abisim import networks
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.extractors import ActionBisimExtractor, SSIExtractor, find_extractors
-from sb3_abisim.frozen import fuse
+from sb3_abisim.frozen import fuse, main
 from sb3_abisim.vec_env import VecEncodeObservations
 
 CONTINUOUS = ("SAC", "TD3", "TQC")
@@ -124,3 +124,15 @@ def test_refusals(path: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"VecNormalize\(norm_obs=False\)"):
         fuse(sb3.PPO("MlpPolicy", VecNormalize(env), device="cpu"), str(path))
     fuse(sb3.PPO("MlpPolicy", VecNormalize(env, norm_obs=False), device="cpu"), str(path))
+
+
+def test_mistakes_of_the_command(path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sb3.PPO("MlpPolicy", Pictures(), device="cpu").save(tmp_path / "plain.zip")
+    for model, message in (
+        ("absent.zip", "there is no model"),
+        ("plain.zip", "not on the embeddings of an encoder"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main([str(tmp_path / model), "-o", str(tmp_path / "out.zip"), "--algo", "ppo", "-e", str(path)])
+        assert stopped.value.code == 2 and message in capsys.readouterr().err
+    assert not (tmp_path / "out.zip").exists()

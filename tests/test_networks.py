@@ -126,3 +126,12 @@ def test_standardize_refuses_a_collapsed_embedding():
     encoder = make_encoder(image_space(3, 15, 15))
     with pytest.raises(ValueError, match="collapsed"):
         encoder.standardize(th.zeros(4, 3, 15, 15))
+
+
+def test_weights_are_float32_whatever_the_default_is():
+    th.set_default_dtype(th.float64)
+    try:
+        encoder = make_encoder(image_space(3, 15, 15))
+    finally:
+        th.set_default_dtype(th.float32)
+    assert {parameter.dtype for parameter in encoder.parameters()} == {th.float32}

@@ -210,6 +210,12 @@ def test_held_out_transitions_are_not_trained_on(data, tmp_path, monkeypatch):
         (["--objective", "ssi", "--env", "Nav2D-v0", "--base", "x"], "base encoder belongs to 'abisim'"),
         (["--objective", "abisim", "--env", "Nav2D-v0", "--base", "missing.safetensors"], "missing.safetensors"),
         (["--objective", "dino", "--env", "Nav2D-v0"], "dino"),
+        (["--objective", "ssi", "--env", "Nav2D-v0", "--seed", "-1"], "seed must be at least 0, got -1"),
+        (["--objective", "abisim", "--env", "Nav2D-v0", "-params", "batch_size:5000"], "too few for a batch of 5000"),
+        (
+            ["--objective", "abisim", "--env", "Nav2D-v0", "-params", "objective_kwargs.n_pairs:1.5"],
+            "n_pairs must be a",
+        ),
     ],
     ids=str,
 )
@@ -219,6 +225,14 @@ def test_command_line_mistakes_exit_2(data, tmp_path, capsys, arguments, message
     assert error.value.code == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.glob("*.safetensors"))
+
+
+def test_too_little_to_hold_out_is_told_at_once(tmp_path):
+    collect(["--env", "Nav2D-v0", "-n", "12", "-o", str(tmp_path / "data"), "--n-envs", "1"])
+    with pytest.raises(ValueError, match=r"no segment held out of .*data .holdout 0.05. .* or set holdout:0"):
+        run(tmp_path / "data", tmp_path / "abisim.safetensors", "abisim", batch_size=4)
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+    assert run(tmp_path / "data", tmp_path / "abisim.safetensors", batch_size=4, holdout=0.0).is_file()
 
 
 def test_numbers_without_a_dot(data, tmp_path):

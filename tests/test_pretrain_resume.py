@@ -114,6 +114,12 @@ def test_finished_run_is_left_alone_and_other_settings_are_refused(data, tmp_pat
     assert output.stat().st_mtime_ns == before
     with pytest.raises(ValueError, match=r"n_updates: 30 there, 40 here"):
         run(data, output, n_updates=40)
+    content = output.read_bytes()
+    output.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(ValueError, match=r"ssi\.safetensors .*To have it written again, remove it first"):
+        run(data, output)
+    output.unlink()
+    assert run(data, output).read_bytes() == content
 
 
 def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):

@@ -207,6 +207,12 @@ def test_the_cache_is_used_and_notices_changes(tmp_path, monkeypatch):
     assert len(calls) == 3
 
 
+def test_an_empty_variable_is_none(monkeypatch):
+    monkeypatch.setenv("SB3_ABISIM_CACHE", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", "/kept/here")
+    assert str(scan_map.cache_folder()) == "/kept/here/sb3_abisim/scans"
+
+
 def glb_with(**header):
     data = json.dumps({"asset": {"version": "2.0"}, **header}).encode()
     data += b" " * (-len(data) % 4)

@@ -95,6 +95,13 @@ class TestCache:
         again = both(folder.with_name("moved"))
         assert {clip.digest for clips in again for clip in clips.clips} == digests
 
+    def test_a_cache_that_cannot_be_written_is_named(self, folder, tmp_path, monkeypatch):
+        two_folders(folder)
+        (tmp_path / "taken").touch()
+        monkeypatch.setenv("SB3_ABISIM_CACHE", str(tmp_path / "taken"))
+        with pytest.raises(OSError, match=r"cannot keep decoded clips in .*taken .*; set SB3_ABISIM_CACHE to a folder"):
+            load_backgrounds(folder, "train")
+
     def test_a_damaged_entry_is_decoded_again(self, folder, cache):
         two_folders(folder)
         expected = shown(load_backgrounds(folder, "train"))

@@ -146,6 +146,8 @@ def _labelled_runs(folders: Sequence[str]) -> list[Run]:
     runs: list[Run] = []
     for word in folders:
         label, folder = split_label(word)
+        if label is not None and label.startswith("_"):
+            raise ValueError(f"Matplotlib hides what is called {label!r}; give a label that does not begin with '_'")
         found = find_runs(folder)
         runs += found if label is None else [dataclasses.replace(run, label=label) for run in found]
     return runs

@@ -62,23 +62,32 @@ def final_model(run: Run) -> BaseAlgorithm:
     """The model that a run ended with, on the CPU; it acts on pictures, whatever it was trained on.
 
     :param run: a zoo run
-    :raises ValueError: if the run has not ended, or if it had wrappers around its environment that are not there here
+    :raises ValueError: if the run has not ended, if its environment is not registered, or if it had wrappers around it
+        that are not there here
     """
+    import gymnasium as gym
     from rl_zoo3.utils import ALGOS
 
+    try:
+        gym.spec(run.env_id)
+    except gym.error.Error as error:
+        raise ValueError(
+            f"{run.folder} was trained in {run.env_id}, which is not registered here; give the module that "
+            "registers it with --gym-packages"
+        ) from error
     missing = not_rebuilt(run.settings)
     if missing:
         raise ValueError(
             f"{run.folder} was trained with {', '.join(missing)}, which is not rebuilt here; look at it with python -m "
             "sb3_abisim.zoo enjoy"
         )
-    path = run.folder / f"{run.env_id}.zip"
+    path = run.folder / f"{run.env_name}.zip"
     if not path.is_file():
         raise ValueError(f"{run.folder} holds no final model ({path.name}); let the run end first")
     model: BaseAlgorithm = ALGOS[run.algo].load(path, device="cpu")
     if isinstance(model.observation_space, EncodedBox):
         # Trained on embeddings, and the environments show pictures.
-        model = fuse(model, str(run.folder / run.env_id / RUN_COPY))
+        model = fuse(model, str(run.folder / run.env_name / RUN_COPY))
     return model
 
 

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.atomic import write_atomic
-from sb3_abisim.benchmark.runs import TRAINING_CURVE, Run, find_runs
+from sb3_abisim.benchmark.runs import TRAINING_CURVE, NoEpisodesError, Run, find_runs
 
 INDEX_NAME = "benchmark.json"
 TEXTS = ("args.yml", "config.yml", "command.txt")
 EVALUATIONS = ("evaluations.npz", "final_evaluations.npz")
+# How JSON and YAML write a letter that is not ASCII.
+_ESCAPED = r"\\[xuU][0-9A-Fa-f]+"
 # An absolute path up to its last part: not within a word, a relative path or a URL.
-_ABSOLUTE = re.compile(r"(?<![\w.~/-])/(?:[^\s/'\",:=\\]+/)*(?=[\w.])")
+_ABSOLUTE = re.compile(rf"(?<![\w.~/-])/(?:(?:[^\s/'\",:=\\]|{_ESCAPED})+/)*(?=[\w.]|{_ESCAPED})")
 
 
 def export(folder: str | Path, output: str | Path) -> Path:
@@ -40,12 +42,16 @@ def export(folder: str | Path, output: str | Path) -> Path:
     part = output.with_name(f".{output.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    for run in runs:
-        _copy_run(run, folder, part / run.folder.relative_to(folder))
-    _copy_markers(runs, folder, part)
-    index = json.loads((folder / INDEX_NAME).read_bytes()) if (folder / INDEX_NAME).is_file() else {}
-    index["runs"] = [{"folder": run.folder.relative_to(folder).as_posix(), "label": run.label} for run in runs]
-    _write(part / INDEX_NAME, without_folders(json.dumps(index, indent=1), folder))
+    try:
+        for run in runs:
+            _copy_run(run, folder, part / run.folder.relative_to(folder))
+        _copy_markers(runs, folder, part)
+        index = json.loads((folder / INDEX_NAME).read_bytes()) if (folder / INDEX_NAME).is_file() else {}
+        index["runs"] = [{"folder": run.folder.relative_to(folder).as_posix(), "label": run.label} for run in runs]
+        _write(part / INDEX_NAME, without_folders(json.dumps(index, indent=1, ensure_ascii=False), folder))
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
     part.rename(output)
     return output
 
@@ -56,21 +62,28 @@ def without_folders(text: str, root: Path) -> str:
     :param text: of a settings file or a command
     :param root: the benchmark's folder
     """
-    return _ABSOLUTE.sub("", text.replace(f"{root.resolve()}/", ""))
+    text = text.replace(f"{root.resolve()}/", "")
+    # The zoo writes commands without quotes, so that nothing says where a path with a space in it begins and ends.
+    for folder in map(str, (Path.cwd(), Path.home())):
+        text = text.replace(folder, re.sub(r"\s", "_", folder))
+    return _ABSOLUTE.sub("", text)
 
 
 def _copy_run(run: Run, root: Path, target: Path) -> None:
     for name in TEXTS:
-        source = run.folder / run.env_id / name
+        source = run.folder / run.env_name / name
         if source.is_file():
-            _write(target / run.env_id / name, without_folders(source.read_text(encoding="utf-8"), root))
+            _write(target / run.env_name / name, without_folders(source.read_text(encoding="utf-8"), root))
     for name in EVALUATIONS:
         if (run.folder / name).is_file():
             with np.load(run.folder / name, allow_pickle=False) as arrays:
                 _write_arrays(target / name, dict(arrays))
     if not (any(run.folder.glob("*.monitor.csv")) or (run.folder / TRAINING_CURVE).is_file()):
         return
-    curve = run.training()
+    try:
+        curve = run.training()
+    except NoEpisodesError:
+        return
     # Shapes as in evaluations.npz, with one episode at each point.
     columns = {"results": curve.returns} | ({} if curve.successes is None else {"successes": curve.successes})
     _write_arrays(
@@ -90,7 +103,7 @@ def _copy_markers(runs: list[Run], root: Path, target: Path) -> None:
     for name in names:
         # The name of a machine says nothing elsewhere.
         kept = {key: value for key, value in markers[name].items() if key != "host"}
-        _write(target / "cells" / f"{name}.json", without_folders(json.dumps(kept, indent=1), root))
+        _write(target / "cells" / f"{name}.json", without_folders(json.dumps(kept, indent=1, ensure_ascii=False), root))
 
 
 def _write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

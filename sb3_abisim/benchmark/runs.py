@@ -38,6 +38,10 @@ TRAINING_CURVE = "training.npz"
 _ENCODER_NAME = re.compile(r"""['"]encoder['"]\s*:\s*(['"]).*?\1""")
 
 
+class NoEpisodesError(ValueError):
+    """No episode of training has ended."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Curve:
     """Returns over the course of a run.
@@ -59,6 +63,7 @@ class Run:
     :param folder: where it lies
     :param label: the method, such as "abisim,frozen"
     :param env_id: trained in
+    :param env_name: what rl-zoo3 makes of it in the names of files (my-Toy-v0 for my/Toy-v0)
     :param algo: rl-zoo3's name
     :param seed: of RL
     :param n_timesteps: budget that was asked for
@@ -71,6 +76,7 @@ class Run:
     folder: Path
     label: str
     env_id: str
+    env_name: str
     algo: str
     seed: int
     n_timesteps: int
@@ -107,7 +113,7 @@ class Run:
         # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
         episodes = load_results(glob.escape(str(self.folder)))
         if not len(episodes):
-            raise ValueError(f"no episode of {self.folder} has ended yet; try again later, or leave the run out")
+            raise NoEpisodesError(f"no episode of {self.folder} has ended yet; try again later, or leave the run out")
         ends = episodes["l"].cumsum().to_numpy()
         stretch = np.minimum((ends - 1) * n_points // max(self.n_timesteps, int(ends[-1])), n_points - 1)
         width = max(self.n_timesteps, int(ends[-1])) / n_points
@@ -159,6 +165,7 @@ def read_run(folder: str | Path) -> Run:
             folder=folder,
             label=method_label(config, str(args["algo"])),
             env_id=args["env"],
+            env_name=found[0].parent.name,
             algo=args["algo"],
             seed=int(args["seed"]),
             n_timesteps=n_timesteps,

@@ -132,6 +132,10 @@ def sweep(
     if metric not in METRICS:
         raise ValueError(f"metric must be one of {', '.join(METRICS)}, got {metric!r}")
     distributions = parse_space(space, objective)
+    for name, distribution in distributions.items():
+        for value in _extremes(distribution):
+            # Raises for a setting that is not there, or cannot be that.
+            build(dataclasses.replace(plan, pretrain_params=(*plan.pretrain_params, f"{name}:{value}")))
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
     trials: list[Trial] = []
@@ -154,6 +158,10 @@ def sweep(
                 study.tell(optuna_trial, value)
         _write_table(root / TABLE_NAME, trials, plan.seeds, metric)
     return trials
+
+
+def _extremes(distribution: "BaseDistribution") -> Sequence[Any]:
+    return getattr(distribution, "choices", None) or (distribution.low, distribution.high)  # type: ignore[attr-defined]
 
 
 def best_of(trials: Sequence[Trial]) -> Trial | None:

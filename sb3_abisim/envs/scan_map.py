@@ -232,8 +232,9 @@ def _settings(settings: dict[str, Any]) -> MapSettings:
 
 def cache_folder() -> Path:
     """Where maps are kept: ``$SB3_ABISIM_CACHE``, or ``sb3_abisim/scans`` in the user's cache folder."""
-    if "SB3_ABISIM_CACHE" in os.environ:
-        return Path(os.environ["SB3_ABISIM_CACHE"])
+    chosen = os.environ.get("SB3_ABISIM_CACHE")
+    if chosen:
+        return Path(chosen)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_abisim" / "scans"
 
 
@@ -252,7 +253,10 @@ def _cached(key: list[Any], settings: MapSettings, make: Callable[[], ScanMap], 
         path.parent.mkdir(parents=True, exist_ok=True)
         made.save(path)
     except OSError as error:
-        warnings.warn(f"cannot keep the map of {made.source} ({error}); set SB3_ABISIM_CACHE", stacklevel=4)
+        warnings.warn(
+            f"cannot keep the map of {made.source} ({error}); set SB3_ABISIM_CACHE to a folder that can be written",
+            stacklevel=4,
+        )
     return made
 
 

@@ -173,6 +173,16 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_abisim"
 
 
+def _make_cache(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError("it cannot be written")
+    except (PermissionError, FileExistsError, NotADirectoryError) as error:
+        remedy = f"set {CACHE_VARIABLE} to a folder that can be written"
+        raise type(error)(f"cannot keep decoded clips in {folder} ({error}); {remedy}") from error
+
+
 def _content_key(source: Source) -> str:
     digest = hashlib.sha256(f"{_CACHE_VERSION}:{FRAME_SHAPE}:{source.is_video}".encode())
     for file in source.files:
@@ -224,7 +234,7 @@ class _Entry:
             file.seek(0)
             _write_header(file, count)
 
-        cache_folder().mkdir(parents=True, exist_ok=True)
+        _make_cache(cache_folder())
         write_atomic(self.frames_path, write)
         note = {"n_frames": count, "sha256": digest.hexdigest(), "source": str(source.path)}
         write_atomic(self.note_path, lambda file: file.write(json.dumps(note).encode()))

@@ -222,8 +222,8 @@ class ActionBisimulation(Objective):
         self.c, self.tau, self.l1_penalty = c, tau, l1_penalty
         self.expectation, self.distance_loss, self.wasserstein = expectation, distance_loss, wasserstein
         for name, count in (("n_pairs", n_pairs), ("n_action_samples", n_action_samples)):
-            if count < 1:
-                raise ValueError(f"{name} must be at least 1, got {count}")
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {count}")
         self.pairs, self.n_pairs = pairs, n_pairs
         self.n_action_samples, self.action_radius = n_action_samples, action_radius
         self.forward_reset_interval = forward_reset_interval

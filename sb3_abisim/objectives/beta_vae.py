@@ -70,7 +70,7 @@ class BetaVAE(Objective):
         """
         mean = self.encoder(batch.observations)
         log_std = self.log_std(mean).clamp(*_LOG_STD_RANGE)
-        z = mean + log_std.exp() * th.randn_like(mean)
+        z = mean + log_std.exp() * th.randn(mean.shape).to(mean.device)
         logits = self.decoder(z)
         loss, terms = beta_vae_loss(logits, batch.observations, mean, log_std, self.kl_weight)
         terms["squared_error"] = (logits.sigmoid() - batch.observations).pow(2).mean()
