@@ -12,8 +12,9 @@ from PIL import Image
 from scan_inputs import HEIGHT, TABLE, WALLS, box, floor, house, own_cache, write, y_up  # noqa: F401
 
 from sb3_abisim.envs import scan_map
+from sb3_abisim.envs.scan_files import SceneError
 from sb3_abisim.envs.scan_map import ScanMap, find_floors
-from sb3_abisim.envs.scan_mesh import SceneError, load_mesh
+from sb3_abisim.envs.scan_mesh import load_mesh
 
 
 def at(scan, x, y):

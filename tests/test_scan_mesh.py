@@ -10,7 +10,9 @@ import trimesh
 from PIL import Image
 from scan_inputs import checkers, floor, own_cache, write  # noqa: F401
 
-from sb3_abisim.envs.scan_mesh import SceneError, load_mesh
+from sb3_abisim.envs.scan_files import SceneError
+from sb3_abisim.envs.scan_map import ScanMap
+from sb3_abisim.envs.scan_mesh import load_mesh
 
 
 def edited(path, edit, binary=None):
@@ -196,6 +198,39 @@ def test_obj_without_its_texture_is_one_warning_and_grey(tmp_path, colour):
         (surface,) = load_mesh(path).surfaces
     assert [str(warning.message).split(",")[0] for warning in warned] == [f"{path} refers to lost.png"]
     assert (surface.coordinates == 160).all()
+
+
+def test_a_lost_texture_is_that_of_its_own_part(tmp_path):
+    """The other half of the floor keeps its colour."""
+    path = obj(tmp_path / "floor.obj", "", True, "map_Kd lost.png\nnewmtl red\nKd 1 0 0")
+    path.write_text(path.read_text().replace("f 1/1 3/3 4/4", "usemtl red\nf 1/1 3/3 4/4"))
+    with pytest.warns(UserWarning, match="refers to lost.png") as warned:
+        surfaces = load_mesh(path).surfaces
+    assert len(warned) == 1
+    assert sorted(tuple(surface.coordinates[0, 0]) for surface in surfaces) == [(160, 160, 160), (255, 0, 0)]
+
+
+def test_a_lost_normal_map_takes_no_colour(tmp_path):
+    path = write(trimesh.Scene([floor()]), tmp_path / "scan.gltf")
+    header = json.loads(path.read_text())
+    header["images"] = [{"uri": "bumps.png"}]
+    header["materials"] = [{"normalTexture": {"index": 0}, "pbrMetallicRoughness": {"baseColorFactor": [0, 1, 0, 1]}}]
+    path.write_text(json.dumps(header))
+    with pytest.warns(UserWarning, match=r"refers to bumps\.png"):
+        (surface,) = load_mesh(path).surfaces
+    assert (surface.coordinates == (0, 255, 0)).all()
+
+
+@pytest.mark.parametrize("place", ["lost.png", "textures/lost.png"])
+def test_a_texture_that_is_put_in_place_is_noticed(tmp_path, place):
+    path = obj(tmp_path / "floor.obj", "", True, "map_Kd textures/lost.png")
+    with pytest.warns(UserWarning, match=r"refers to lost\.png, which is not there"):
+        before = ScanMap.from_mesh(path)
+    with pytest.warns(UserWarning, match=r"refers to lost\.png, which is not there"):
+        assert ScanMap.from_mesh(path).fingerprint == before.fingerprint
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    checkers().save(tmp_path / place)
+    assert ScanMap.from_mesh(path).fingerprint != before.fingerprint
 
 
 def test_obj_with_colours_of_vertices_needs_no_material(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scan_inputs import empty_room
 
-from sb3_abisim.envs.scan_mesh import SceneError
+from sb3_abisim.envs.scan_files import SceneError
 from sb3_abisim.envs.scan_nav import ScanNavEnv
 
 

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.atomic import file_digest, write_atomic
-from sb3_abisim.envs.scan_mesh import LEVEL_BIN, ScanMesh, SceneError, level_areas, load_mesh, warn_missing
+from sb3_abisim.envs.scan_files import SceneError
+from sb3_abisim.envs.scan_mesh import LEVEL_BIN, ScanMesh, level_areas, load_mesh, warn_missing
 from sb3_abisim.envs.scan_raster import Nearest, contour_pixels, fragments, shade
 
 FORMAT = "sb3_abisim scan map 1"

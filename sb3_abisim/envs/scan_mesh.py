@@ -4,10 +4,8 @@ A :class:`ScanMesh` is z-up, in metres. Files are read by trimesh (``pip install
 """
 
 import io
-import json
 import os
 import re
-import struct
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -20,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.atomic import file_digest
+from sb3_abisim.envs.scan_files import SceneError, bare_name, check_file, lost_materials, primitives, texture_uri
 
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 UP_AXES = ("auto", "y", "z")
 MISSING_COLOUR = (160, 160, 160)
 # Heights are counted in bins of this many metres.
@@ -31,24 +29,9 @@ MIN_UP_RATIO = 1.25
 # A face is level where its unit normal's vertical part is above this.
 _LEVEL_NORMAL = 0.9
 _EXTENT = (1.0, 200.0)  # m
-_UNSUPPORTED = {
-    "KHR_draco_mesh_compression": "Draco compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
-    "EXT_meshopt_compression": "meshopt compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
-    "KHR_texture_basisu": "KTX2 textures (convert them: `npx @gltf-transform/cli ktxdecompress IN OUT`)",
-    "KHR_mesh_quantization": "quantised vertices (undo it: `npx @gltf-transform/cli dequantize IN OUT`)",
-}
-# Extensions that a file may require and that change nothing seen from above, or that trimesh knows.
-_HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-_FLOAT = 5126  # glTF's component type
-_TRIANGLES = (4, 5)  # glTF's modes that trimesh reads
 _PICTURES = "export it again with PNG or JPEG textures of at most 8192 x 8192 pixels"  # Pillow refuses far larger ones
 _COLOURED_VERTEX = re.compile(rb"^v(?:[ \t]+[-+.\deE]+){6}[ \t\r]*$", re.MULTILINE)  # of an OBJ file
 _TEXTURE_VERTEX = re.compile(rb"^vt[ \t].*$", re.MULTILINE)
-_UNMOVED = {"offset": [0, 0], "rotation": 0, "scale": [1, 1]}
-
-
-class SceneError(ValueError):
-    """A scan that cannot be used; the message names the file and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +80,7 @@ def load_mesh(path: str | os.PathLike[str], up: str = "auto") -> ScanMesh:
     path = Path(path)
     if up not in UP_AXES:
         raise ValueError(f"up must be one of {UP_AXES}, got {up!r}")
-    parts, files = _read(path, _check_file(path))
+    parts, files = _read(path, check_file(path))
     vertices, faces, surfaces = [], [], []
     n_vertices = 0
     for part_vertices, part_faces, surface in parts:
@@ -117,74 +100,6 @@ def load_mesh(path: str | os.PathLike[str], up: str = "auto") -> ScanMesh:
     return _turn_upright(path, mesh, up)
 
 
-def _check_file(path: Path) -> Any:
-    """Refuse what can be told to be wrong without reading all of it; gives a glTF file's JSON part, else {}."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise SceneError(f"{path} is no scan file: its suffix must be one of {', '.join(SUFFIXES)}")
-    if not path.is_file():
-        raise SceneError(f"there is no scan file {path}; check the path")
-    with open(path, "rb") as file:
-        head = file.read(64)
-    if not head:
-        raise SceneError(f"{path} is empty; download or copy it again")
-    if head.startswith(b"version https://git-lfs"):
-        raise SceneError(f"{path} is a Git LFS pointer, not the scan itself; run `git lfs pull` in its repository")
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        return {}
-    try:
-        header = _glb_header(path, head) if path.suffix.lower() == ".glb" else json.loads(path.read_bytes())
-        _check_extensions(path, header)
-    except SceneError:
-        raise
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise SceneError(f"{path} cannot be read ({error}); download or export it again") from error
-    return header
-
-
-def _glb_header(path: Path, head: bytes) -> Any:
-    if len(head) < 20 or head[:4] != b"glTF":
-        raise SceneError(f"{path} is not a binary glTF file; download it again, or give it the suffix of its format")
-    total, n_json = struct.unpack("<I", head[8:12])[0], struct.unpack("<I", head[12:16])[0]
-    if path.stat().st_size < total:
-        raise SceneError(f"{path} is truncated: it has {path.stat().st_size} of {total} bytes; download it again")
-    with open(path, "rb") as file:
-        file.seek(20)
-        return json.loads(file.read(n_json))
-
-
-def _check_extensions(path: Path, header: dict[str, Any]) -> None:
-    """Refuse what trimesh passes over and would show as something else."""
-    for name in header.get("extensionsRequired", []):
-        if name in _UNSUPPORTED:
-            raise SceneError(f"{path} uses {_UNSUPPORTED[name]}, which is not supported")
-        if not name.startswith(_HARMLESS):
-            raise SceneError(f"{path} needs the glTF extension {name}, which is not supported; export it without")
-    for primitive, texture in _primitives(header):
-        names = {"POSITION", "TEXCOORD_0"} if texture else {"POSITION"}
-        read = [header["accessors"][index] for name, index in primitive["attributes"].items() if name in names]
-        if any(accessor["componentType"] != _FLOAT for accessor in read):
-            raise SceneError(f"{path} uses {_UNSUPPORTED['KHR_mesh_quantization']}, which is not supported")
-        moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
-        chosen = moved.get("texCoord", texture.get("texCoord", 0))
-        if chosen or any(moved.get(k, v) != v for k, v in _UNMOVED.items()):
-            raise SceneError(
-                f"{path} has a colour texture in a second set of coordinates, or moved or repeated by "
-                "KHR_texture_transform, which is not supported; bake the texture (in Blender) and export it again"
-            )
-
-
-def _primitives(header: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """A glTF file's runs of triangles, each with its material's reference to a colour texture, or {}."""
-    found = []
-    for primitive in (p for mesh in header.get("meshes", []) for p in mesh["primitives"]):
-        if primitive.get("mode", 4) in _TRIANGLES:
-            material = header["materials"][primitive["material"]] if "material" in primitive else {}
-            glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-            metallic = material.get("pbrMetallicRoughness", {})
-            found.append((primitive, glossy.get("diffuseTexture") or metallic.get("baseColorTexture") or {}))
-    return found
-
-
 _Part = tuple[NDArray[np.float64], NDArray[np.int64], Surface]
 
 
@@ -198,22 +113,27 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
     files = {path.name: file_digest(path)}
     missing: list[str] = []
     damaged: list[str] = []
+    libraries: list[bytes] = []  # of an OBJ file's materials
 
     class Recorder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc, unused-ignore]
         def get(self, name: str) -> bytes:
             # glTF writes a space as %20. Exporters write paths of their own machine: then the file beside the scan.
             # Nothing outside of the scan's folder is read.
             folder = path.parent.resolve()
-            beside = re.split(r"[/\\]", unquote(name.strip()))[-1]
-            for candidate in (name.strip(), unquote(name.strip()), beside):
+            candidates = [name.strip(), unquote(name.strip()), bare_name(name)]
+            candidates = [each for each in candidates if (folder / each).resolve().is_relative_to(folder)]
+            for candidate in candidates:
                 file = folder / candidate
-                if file.resolve().is_relative_to(folder) and file.is_file():
+                if file.is_file():
                     files[candidate] = file_digest(file)
                     data = file.read_bytes()
+                    if file.suffix.lower() == ".mtl":
+                        libraries.append(data)
                     if kind in ("obj", "ply") and file.suffix.lower() != ".mtl" and not _is_picture(data):
                         damaged.append(candidate)
                     return data
-            files[beside] = ""
+            # Wherever it appears, it is noticed.
+            files.update(dict.fromkeys(candidates, ""))
             missing.append(name)
             raise FileNotFoundError(name)
 
@@ -222,18 +142,22 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
             warnings.simplefilter("ignore")
             load = partial(trimesh.load_scene, file_type=kind, resolver=Recorder(str(path)), process=False)
             scene = _load(path.read_bytes(), kind, load, missing)
-            parts = _parts(scene, trimesh, missing)
+            lost = lost_materials(kind, header, libraries, missing)
+            parts = _parts(scene, trimesh, lost)
     except Exception as error:  # what trimesh raises for a damaged file depends on where the damage is
-        lost = f"; it refers to {missing[0]}, which is not there" if missing else ""
-        raise SceneError(f"{path} cannot be read ({type(error).__name__}: {error}){lost}; export it again") from error
+        absent = f"; it refers to {missing[0]}, which is not there" if missing else ""
+        raise SceneError(f"{path} cannot be read ({type(error).__name__}: {error}){absent}; export it again") from error
     warn_missing(path, missing)
     if damaged:
         raise SceneError(f"{path}: the texture {damaged[0]} cannot be decoded; {_PICTURES}")
     visuals = _visuals(scene)
-    n_textured = sum(bool(texture) and "TEXCOORD_0" in p["attributes"] for p, texture in _primitives(header))
-    if not missing and (n_lost := n_textured - sum(map(_shows_picture, visuals))) > 0:
-        raise SceneError(f"{path}: the textures of {n_lost} of {n_textured} parts cannot be decoded; {_PICTURES}")
-    if n_bare := sum(_is_bare(visual) and not (missing and visual.kind) for visual in visuals):
+    n_textured = sum(
+        bool(texture) and "TEXCOORD_0" in primitive["attributes"] and texture_uri(header, texture) not in missing
+        for primitive, texture in primitives(header)
+    )
+    if (n_damaged := n_textured - sum(map(_shows_picture, visuals))) > 0:
+        raise SceneError(f"{path}: the textures of {n_damaged} of {n_textured} parts cannot be decoded; {_PICTURES}")
+    if n_bare := sum(_is_bare(visual) and not _has_lost(visual, lost) for visual in visuals):
         warnings.warn(f"{path}: {n_bare} of {len(visuals)} parts have no colour and are drawn grey", stacklevel=3)
     if not parts:
         found = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
@@ -278,21 +202,26 @@ def _is_bare(visual: Any) -> bool:
     return _material(visual.material)[0] is None and "kd" not in visual.material.kwargs
 
 
+def _has_lost(visual: Any, lost: Callable[[Any], bool]) -> bool:
+    return visual.kind == "texture" and lost(visual.material)
+
+
 def warn_missing(source: str | os.PathLike[str], names: Iterable[str]) -> None:
     """Say which files of a scan are not there, if any.
 
     :param source: the scan
     :param names: of the files that it refers to
     """
-    if missing := sorted(set(names)):
+    # One file may have been looked for in several places.
+    if missing := sorted(set(map(bare_name, names))):
         warnings.warn(
-            f"{source} refers to {', '.join(missing)}, which is not there (in the scan's folder); its surfaces get a "
-            "flat colour",
+            f"{source} refers to {', '.join(missing)}, which is not there (in the scan's folder); what it covers gets "
+            "a flat colour",
             stacklevel=4,
         )
 
 
-def _parts(scene: Any, trimesh: Any, missing: list[str]) -> list[_Part]:
+def _parts(scene: Any, trimesh: Any, lost: Callable[[Any], bool]) -> list[_Part]:
     parts = []
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
@@ -304,11 +233,11 @@ def _parts(scene: Any, trimesh: Any, missing: list[str]) -> list[_Part]:
         # A mirrored part would be seen from the inside.
         if np.linalg.det(transform[:3, :3]) < 0:
             faces = faces[:, ::-1]
-        parts.append((np.asarray(vertices, dtype=np.float64), faces, _surface(geometry.visual, faces, missing)))
+        parts.append((np.asarray(vertices, dtype=np.float64), faces, _surface(geometry.visual, faces, lost)))
     return parts
 
 
-def _surface(visual: Any, faces: NDArray[np.int64], missing: list[str]) -> Surface:
+def _surface(visual: Any, faces: NDArray[np.int64], lost: Callable[[Any], bool]) -> Surface:
     if visual.kind == "texture":
         image, factor = _material(visual.material)
         if image is not None and visual.uv is not None:
@@ -318,11 +247,11 @@ def _surface(visual: Any, faces: NDArray[np.int64], missing: list[str]) -> Surfa
         # An untextured material has its own colour, unless it has lost its texture.
         # glTF multiplies it by the vertices' colours.
         colours = visual.vertex_attributes.get("color")
-        if colours is not None and not missing:
+        if colours is not None and not lost(visual.material):
             largest = np.iinfo(colours.dtype).max if colours.dtype.kind == "u" else 1.0
             shown = np.asarray(colours, dtype=np.float32)[:, :3] / np.float32(largest) * factor
             return Surface(len(faces), None, shown[faces])
-        flat = np.array(MISSING_COLOUR if missing else factor, dtype=np.float32)
+        flat = np.array(MISSING_COLOUR if lost(visual.material) else factor, dtype=np.float32)
         return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
     if visual.kind == "vertex":
         return Surface(len(faces), None, np.asarray(visual.vertex_colors, dtype=np.float32)[faces][..., :3])

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.envs.scan_files import SceneError
 from sb3_abisim.envs.scan_map import ScanMap
-from sb3_abisim.envs.scan_mesh import SceneError
 
 NODE = 0.05  # m between neighbouring nodes
 # A goal is used if this share of points drawn in its view are starts, so that drawing one ends soon.
