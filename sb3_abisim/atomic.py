@@ -8,6 +8,7 @@ releases when its holder dies, so that a kill leaves nothing to clean up by hand
 import contextlib
 import hashlib
 import os
+import re
 import secrets
 import socket
 from collections.abc import Callable, Iterator
@@ -55,6 +56,8 @@ def fsync_folder(path: str | os.PathLike[str]) -> None:
 
     :param path: the folder
     """
+    if os.name == "nt":
+        return  # where a folder cannot be opened
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -67,7 +70,7 @@ def is_temporary(name: str) -> bool:
 
     :param name: a file name without its folder
     """
-    return name.startswith(".") and name.endswith(_TEMPORARY_SUFFIX)
+    return re.fullmatch(rf"\..+\.[0-9a-f]{{16}}{re.escape(_TEMPORARY_SUFFIX)}", name) is not None
 
 
 def remove_temporaries(folder: str | os.PathLike[str]) -> None:
@@ -89,8 +92,10 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
     :param path: an existing folder
     :raises FolderLockedError: at once, if another process (or another block of this one) holds the lock
     """
-    import fcntl  # POSIX only; reading data must work without it
-
+    try:
+        import fcntl
+    except ImportError as error:
+        raise ImportError("writing in a folder that others may write in needs Linux or macOS (or WSL)") from error
     folder = Path(path)
     lock_path = folder / LOCK_NAME
     while True:

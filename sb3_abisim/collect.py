@@ -13,6 +13,7 @@ import importlib
 import json
 import math
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -212,7 +213,7 @@ def make_vector_env(env_id: str, n_envs: int, env_kwargs: dict[str, Any]) -> Vec
         same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
         wrappers = (_copy_observations,)
         return gym.make_vec(env_id, n_envs, "sync", vector_kwargs=same_step, wrappers=wrappers, **env_kwargs)
-    except (TypeError, gym.error.Error) as error:
+    except (TypeError, OSError, gym.error.Error) as error:
         raise ValueError(f"cannot make {env_id} with {env_kwargs}: {error}") from error
 
 
@@ -247,8 +248,8 @@ def _fingerprint(env: VectorEnv[Any, Any, Any]) -> str | None:
 def _steps_per_shard(env: VectorEnv[Any, Any, Any], env_id: str, env_kwargs: dict[str, Any]) -> int:
     """Steps of each copy: whole time limits, so that late stages of episodes are seen as often as early ones."""
     spec = gym.registry[env_id]
-    limit = int(env_kwargs.get("max_episode_steps") or spec.max_episode_steps or 1)
-    limit = max(1, limit)  # -1 is Gymnasium's word for none; it refuses other numbers below 1
+    given = int(env_kwargs.get("max_episode_steps") or spec.max_episode_steps or 0)
+    limit = max(1, given)  # -1 is Gymnasium's word for none; it refuses other numbers below 1
     row = math.prod(env.single_observation_space.shape or ())
     if _draws_factors(env):
         row = sum(array[0].nbytes for array in _factors(env).values())
@@ -259,6 +260,12 @@ def _steps_per_shard(env: VectorEnv[Any, Any, Any], env_id: str, env_kwargs: dic
         raise ValueError(
             f"a shard of {env.num_envs} episodes of {limit} steps would take "
             f"{steps * env.num_envs * row / 2**30:.1f} GiB of memory, more than {MAX_SHARD_BYTES / 2**30:.1f}; {remedy}"
+        )
+    if given < 1:
+        warnings.warn(
+            f"{env_id} has no time limit, so that each episode is left after {steps} steps; if its episodes last "
+            "longer, give one (--env-kwargs max_episode_steps:K) or fewer --n-envs",
+            stacklevel=4,
         )
     return steps
 
@@ -284,6 +291,16 @@ def _parse_env_kwargs(pairs: list[str]) -> dict[str, Any]:
             except (ValueError, SyntaxError):
                 continue
     return result
+
+
+def add_gym_packages(parser: argparse.ArgumentParser) -> None:
+    """Add ``--gym-packages``, for :func:`import_packages`.
+
+    :param parser: of a command
+    """
+    parser.add_argument(
+        "--gym-packages", nargs="+", action="extend", default=[], metavar="MODULE", help="imported to register ids"
+    )
 
 
 def import_packages(names: list[str]) -> None:
@@ -318,8 +335,10 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("-o", required=True, metavar="DIR", help="the dataset's folder")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--n-envs", type=int, default=64, help="environments stepped together (default: 64)")
-    parser.add_argument("--env-kwargs", nargs="+", default=[], metavar="K:V", help="keyword arguments, such as k:1.5")
-    parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="imported to register ids")
+    parser.add_argument(
+        "--env-kwargs", nargs="+", action="extend", default=[], metavar="K:V", help="keyword arguments, such as k:1.5"
+    )
+    add_gym_packages(parser)
     args = parser.parse_args(argv)
     try:
         import_packages(args.gym_packages)

@@ -6,6 +6,7 @@ the files that were read count as this process's memory until they are given bac
 
 import mmap
 import os
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ from sb3_abisim.dataset_format import (
 
 # Above this size, opening a dataset compares sizes only; TransitionDataset(path, verify=True) compares hashes too.
 VERIFY_BELOW_BYTES = 4 * 10**9
+# A process may have 256 open on macOS. Of the paper's data at most 157 are used at a time.
+MAX_OPEN_FILES = 200
 # Files whose hash this process has found right: (path, size, time of the last change, sha256).
 _VERIFIED: set[tuple[str, int, int, str]] = set()
 # Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbours with it, so
@@ -108,11 +111,12 @@ class TransitionDataset:
         frames_per_shard = [shard["n_frames"] for shard in self.meta["shards"]]
         # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
         self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
-        self._maps: dict[tuple[str, int], np.memmap[Any, Any]] = {}
+        # Open files, the last used ones at the end.
+        self._maps: OrderedDict[tuple[str, int], np.memmap[Any, Any]] = OrderedDict()
         self._bytes_read = 0
         n_shards = len(frames_per_shard)
-        self._actions = np.concatenate([self._shard("actions", k) for k in range(n_shards)])
-        self._ends = np.concatenate([self._shard("ends", k) for k in range(n_shards)])
+        self._actions = np.concatenate([self._read("actions", k) for k in range(n_shards)])
+        self._ends = np.concatenate([self._read("ends", k) for k in range(n_shards)])
         self._last = np.flatnonzero(self._ends != INSIDE)  # the last frame of each segment
         self._check_ends()
         self._remaining = self._make_remaining()
@@ -304,19 +308,26 @@ class TransitionDataset:
 
     def _shard(self, name: str, shard: int) -> NDArray[Any]:
         """One array of a shard, memory-mapped at its first use."""
-        if (name, shard) not in self._maps:
-            path = self.path / array_file(name, shard)
-            dtype, row_shape = array_layout(self.meta, name)
-            try:
-                array = np.load(path, mmap_mode="r", allow_pickle=False)
-            except ValueError as error:
-                raise DatasetError(f"{path} is not an array file of ours: {error}") from None
-            expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
-            if array.dtype != dtype or array.shape != expected:
-                raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
-            self._maps[name, shard] = array
+        key = name, shard
+        if key not in self._maps:
+            self._maps[key] = self._read(name, shard, mmap_mode="r")
+            if len(self._maps) > MAX_OPEN_FILES:
+                self._maps.popitem(last=False)
+        self._maps.move_to_end(key)
         # Indexing a plain array is faster than indexing its memory-mapped subclass.
-        return self._maps[name, shard].view(np.ndarray)
+        return self._maps[key].view(np.ndarray)
+
+    def _read(self, name: str, shard: int, mmap_mode: Literal["r"] | None = None) -> Any:
+        path = self.path / array_file(name, shard)
+        dtype, row_shape = array_layout(self.meta, name)
+        try:
+            array = np.load(path, mmap_mode=mmap_mode, allow_pickle=False)
+        except ValueError as error:
+            raise DatasetError(f"{path} is not an array file of ours: {error}") from None
+        expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
+        if array.dtype != dtype or array.shape != expected:
+            raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
+        return array
 
     def _make_remaining(self) -> NDArray[np.int32]:
         """Steps from each frame to the last of its segment."""
@@ -365,11 +376,12 @@ def _read_meta(path: Path) -> dict[str, Any]:
         if (path / CONFIG_NAME).exists():
             raise DatasetError(f"{path} is unfinished (no {META_NAME}); run the command that began it again")
         raise DatasetError(f"{path} is not a dataset (no {META_NAME}); make one with python -m sb3_abisim.collect")
-    meta = from_json_file(path / META_NAME)
     try:
+        meta = from_json_file(path / META_NAME)
         check_meta(meta)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(f"{path / META_NAME} is damaged or not ours: {error}") from None
+        remedy = "run the command that made the dataset again, in a new folder if it refuses"
+        raise DatasetError(f"{path / META_NAME} is damaged or not ours: {error}; {remedy}") from None
     return meta
 
 

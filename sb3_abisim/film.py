@@ -13,7 +13,7 @@ import numpy as np
 from sb3_abisim.atomic import write_atomic
 from sb3_abisim.benchmark.evaluate import final_model, split_kwargs
 from sb3_abisim.benchmark.runs import read_run
-from sb3_abisim.collect import import_packages
+from sb3_abisim.collect import add_gym_packages, import_packages
 from sb3_abisim.zoo import DISTRACTOR_IDS
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the GIF to write")
     parser.add_argument("--episodes", type=int, default=4, help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: %(default)s)")
-    parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="imported to register ids")
+    add_gym_packages(parser)
     args = parser.parse_args(argv)
     if importlib.util.find_spec("PIL") is None:
         parser.error("Pillow is not installed; run: pip install 'sb3_abisim[plots]'")
@@ -101,7 +101,7 @@ def main(argv: list[str] | None = None) -> None:
     try:
         import_packages(args.gym_packages)
         success = film(args.run, args.output, args.episodes, args.seed)
-    except ValueError as error:
+    except (ValueError, OSError, ImportError) as error:
         parser.error(str(error))
     print(f"Wrote {args.output}; {success:.0%} of its {args.episodes} episodes were successful")
 

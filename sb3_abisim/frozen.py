@@ -95,11 +95,13 @@ def main(argv: list[str] | None = None) -> None:
         if len(copies) != 1:
             parser.error(f"{args.model.parent} holds {len(copies)} encoder files */{RUN_COPY}; give --encoder")
         encoder = str(copies[0])
+    # As Stable-Baselines3 does.
+    output = args.output if args.output.suffix else args.output.with_suffix(".zip")
     try:
-        fuse(ALGOS[args.algo].load(args.model, device="cpu"), encoder).save(args.output)
-    except (ValueError, FileNotFoundError) as error:
+        fuse(ALGOS[args.algo].load(args.model, device="cpu"), encoder).save(output)
+    except (ValueError, OSError) as error:
         parser.error(str(error))
-    print(f"Wrote {args.output}, a model that acts on pictures")
+    print(f"Wrote {output}, a model that acts on pictures")
 
 
 if __name__ == "__main__":

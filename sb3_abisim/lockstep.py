@@ -21,7 +21,8 @@ class LockstepVecEnv(DummyVecEnv):
     """``DummyVecEnv`` for the environments of this package: the same observations, rewards and infos, sooner.
 
     :param env_fns: functions that make the environments: all ``gymnasium.make`` of one id of this package with the
-        same arguments, in any wrappers that leave actions as they are
+        same arguments, in any wrappers that leave actions as they are and do not look at the environment
+        before they step it: all copies have moved by then
     :raises ValueError: for other environments; use ``DummyVecEnv`` for them
     """
 

@@ -75,10 +75,15 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
             jpeg_encoding=False,
         )
     content = hashlib.sha256()
-    stored.storage.update_episodes(_to_episode(s, channels_last) for s in _hashed(_segments(dataset), content))
-    identity = {key: dataset.meta[key] for key in IDENTITY_KEYS}
-    ours = identity | {"rewards_recorded": False, "content_sha256": content.hexdigest()}
-    stored.storage.update_metadata({METADATA_KEY: ours})
+    # Without its sum while episodes are missing: a kill leaves a dataset that is not taken for a whole one.
+    ours = {key: dataset.meta[key] for key in IDENTITY_KEYS} | {"rewards_recorded": False, "content_sha256": None}
+    try:
+        stored.storage.update_metadata({METADATA_KEY: ours})
+        stored.storage.update_episodes(_to_episode(s, channels_last) for s in _hashed(_segments(dataset), content))
+        stored.storage.update_metadata({METADATA_KEY: ours | {"content_sha256": content.hexdigest()}})
+    except BaseException:
+        minari.delete_dataset(dataset_id)
+        raise
 
 
 def _check_id(dataset_id: str) -> None:
@@ -117,11 +122,18 @@ def import_dataset(dataset_id: str, folder: str | Path) -> str:
             writer.write_shard(n_shards, group)
             n_shards += 1
         if not n_shards:
-            raise ValueError(f"Minari dataset {dataset_id} has no episodes; export it again")
+            raise ValueError(f"Minari dataset {dataset_id} has no episodes; {_again(dataset_id)}")
         expected = metadata.get(METADATA_KEY, {}).get("content_sha256", content.hexdigest())
         if content.hexdigest() != expected:
-            raise ValueError(f"Minari dataset {dataset_id} is damaged or was changed since its export; export it again")
+            what = (
+                f"Minari dataset {dataset_id} is damaged, was changed since its export or was not exported to its end"
+            )
+            raise ValueError(f"{what}; {_again(dataset_id)}")
         return writer.finish(n_shards)
+
+
+def _again(dataset_id: str) -> str:
+    return f"remove it with `minari delete {dataset_id}` and export it again"
 
 
 def _import_minari() -> Any:

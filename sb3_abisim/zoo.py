@@ -200,7 +200,7 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
                     "write a YAML file for it, as docs/zoo.md shows"
                 )
             hyperparams, saved_hyperparams = original(self)
-            _check_embeddings(hyperparams)
+            _prepare_embeddings(hyperparams, self.device)
             return hyperparams, saved_hyperparams
         if self.trial_id is not None:
             raise ValueError(
@@ -216,7 +216,7 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
             replaced = method.hyperparameters(_entries(Path(self.config))[env_id], custom)
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = original(self)
-        _check_embeddings(hyperparams)
+        _prepare_embeddings(hyperparams, self.device)
         if hyperparams.get("n_envs", 1) > 1 and "env_wrapper" not in hyperparams:
             self.vec_env_class = _in_lockstep(self.vec_env_class)
         # Hyperparameters are selected on the training clips, so that evaluation clips stay unseen.
@@ -230,8 +230,14 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
     return read_hyperparameters
 
 
-def _check_embeddings(hyperparams: dict[str, Any]) -> None:
-    if encoding_kwargs(hyperparams) is not None and _normalizes_observations(hyperparams.get("normalize", False)):
+def _prepare_embeddings(hyperparams: dict[str, Any], device: Any) -> None:
+    """Refuse what would change embeddings, and make them on the device of ``--device``."""
+    if encoding_kwargs(hyperparams) is None:
+        return
+    # A copy: config.yml names the device as little as it does for the rest of the run.
+    hyperparams["vec_env_wrapper"] = copy.deepcopy(hyperparams["vec_env_wrapper"])
+    (encoding_kwargs(hyperparams) or {}).setdefault("device", str(device))
+    if _normalizes_observations(hyperparams.get("normalize", False)):
         raise ValueError(
             f"normalize={hyperparams['normalize']!r} would change the embeddings of the frozen encoder; give "
             '"dict(norm_obs=False, norm_reward=True)"'

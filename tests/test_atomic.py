@@ -95,10 +95,10 @@ def test_writers_of_one_process_do_not_share_a_temporary_file(tmp_path: Path) ->
 
 
 def test_remove_temporaries_spares_other_files(tmp_path: Path) -> None:
-    for name in (".file.123.tmp", "file", "notes.tmp", ".lock"):
+    for name in (f".file.{'0a' * 8}.tmp", "file", "notes.tmp", ".draft.tmp", ".lock"):
         (tmp_path / name).touch()
     remove_temporaries(tmp_path)
-    assert sorted(os.listdir(tmp_path)) == [".lock", "file", "notes.tmp"]
+    assert sorted(os.listdir(tmp_path)) == [".draft.tmp", ".lock", "file", "notes.tmp"]
 
 
 def test_file_digest_is_sha256(tmp_path: Path) -> None:

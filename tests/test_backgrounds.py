@@ -140,6 +140,15 @@ class TestFrames:
         assert len(set(prints)) == 4
         assert Backgrounds("elsewhere", "eval", clips).fingerprint == prints[0] == numbered.fingerprint
 
+    def test_selections_are_shared_and_few_clips_are_open(self, numbered, monkeypatch):
+        assert numbered.select(["b", "a"]) is numbered.select(["b", "a"]) is not numbered.select(["a", "b"])
+        monkeypatch.setattr(module, "MAX_OPEN_CLIPS", 2)
+        before = [numbered.frames(np.array([clip]), np.array([1])) for clip in range(3)]
+        for clip in (0, 1, 2, 0, 2, 1):
+            fresh = numbered.frames(np.array([clip]), np.array([1]))
+            assert np.array_equal(fresh, before[clip])
+        assert list(numbered._arrays) == [2, 1]
+
     def test_select(self, numbered):
         chosen = numbered.select(["c", "a"])
         assert chosen.names == ("c", "a") and chosen.lengths.tolist() == [7, 4]

@@ -204,7 +204,7 @@ def test_something_else_is_refused_untouched(tmp_path: Path) -> None:
 def test_foreign_files_in_a_dataset_survive_but_debris_does_not(tmp_path: Path) -> None:
     collect_index(tmp_path / "d", 50)
     before = tree(tmp_path / "d")
-    for name in ("notes.txt", "frames-00007.npy", ".frames-00001.npy.123.tmp", ".lock"):
+    for name in ("notes.txt", "frames-00007.npy", f".frames-00001.npy.{'0a' * 8}.tmp", ".lock"):
         (tmp_path / "d" / name).write_bytes(b"x")
     collect_index(tmp_path / "d", 50)
     assert set(tree(tmp_path / "d")) == {*before, "notes.txt"}
@@ -246,7 +246,8 @@ def test_full_disk_is_one_message_and_resumes(
 
 def test_an_environment_made_without_a_limit(tmp_path: Path) -> None:
     """-1 is Gymnasium's word for none."""
-    collect("PlainEnv-v0", 50, tmp_path / "d", n_envs=2, env_kwargs={"max_episode_steps": -1})
+    with pytest.warns(UserWarning, match="PlainEnv-v0 has no time limit"):
+        collect("PlainEnv-v0", 50, tmp_path / "d", n_envs=2, env_kwargs={"max_episode_steps": -1})
     assert len(TransitionDataset(tmp_path / "d").valid_starts()) == 50
 
 
@@ -414,3 +415,29 @@ def test_an_environment_that_draws_into_what_it_returned(tmp_path: Path) -> None
         frames.append(dataset.frames(np.arange(dataset.n_frames)))
     assert (dataset.ends > 0).sum() > 8
     np.testing.assert_array_equal(*frames)
+
+
+def test_an_environment_without_a_time_limit_is_a_warning(tmp_path: Path) -> None:
+    gym.register("Endless-v0", entry_point=index_env.PlainEnv)
+    with pytest.warns(UserWarning, match="Endless-v0 has no time limit, so that each episode is left after 24 steps"):
+        collect("Endless-v0", 60, tmp_path / "d", n_envs=2)
+
+
+def test_what_an_environment_cannot_open_is_not_blamed_on_the_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Bare(index_env.PlainEnv):
+        def __init__(self) -> None:
+            (tmp_path / "asset.bin").read_bytes()
+
+    gym.register("Bare-v0", entry_point=Bare)
+    with pytest.raises(SystemExit) as stopped:
+        main(["--env", "Bare-v0", "-n", "10", "-o", str(tmp_path / "d")])
+    assert stopped.value.code == 2
+    assert "cannot make Bare-v0 with {}: " in capsys.readouterr().err and not (tmp_path / "d").exists()
+
+
+def test_env_kwargs_may_be_given_one_by_one(tmp_path: Path) -> None:
+    words = ["--env", "IndexEnv-v0", "-n", "10", "-o", str(tmp_path / "d"), "--n-envs", "2"]
+    main([*words, "--env-kwargs", "offset:1", "--env-kwargs", "max_episode_steps:3"])
+    assert TransitionDataset(tmp_path / "d").env_kwargs == {"offset": 1, "max_episode_steps": 3}

@@ -261,6 +261,16 @@ def test_bad_indices_are_refused(dataset: TransitionDataset, index: object) -> N
         dataset.actions(index)
 
 
+def test_more_shards_than_a_process_may_have_open(dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    everything = np.arange(dataset.n_frames)
+    before = dataset.frames(everything)
+    monkeypatch.setattr(dataset_module, "MAX_OPEN_FILES", 3)
+    few = TransitionDataset(dataset.path)
+    for _ in range(2):
+        assert np.array_equal(few.frames(everything), before)
+        assert len(dataset.meta["shards"]) > len(few._maps) == 3
+
+
 def test_parts_share_no_segment(folder: Path) -> None:
     dataset = TransitionDataset(folder, holdout=0.2)
     segment = np.cumsum(np.concatenate([[0], dataset.ends[:-1] != INSIDE]))

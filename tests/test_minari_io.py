@@ -185,7 +185,32 @@ def test_damage_in_the_minari_file_is_noticed(ours: Path, tmp_path: Path, store:
     export_dataset(ours, "index-v0")
     with h5py.File(store / "index-v0" / "data" / "main_data.hdf5", "a") as file:
         file["episode_3/observations"][1, 0, 2, 2] ^= 1
-    with pytest.raises(ValueError, match="index-v0 is damaged or was changed"):
+    with pytest.raises(ValueError, match=r"index-v0 is damaged, was changed .* `minari delete index-v0`"):
+        import_dataset("index-v0", tmp_path / "back")
+    assert not (tmp_path / "back" / "meta.json").exists()
+
+
+def test_an_export_that_is_stopped_leaves_nothing_or_nothing_that_is_taken_for_whole(
+    ours: Path, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, kept = minari_io._to_episode, []
+
+    def stopped(*args: object) -> object:
+        kept.append(args)
+        if len(kept) == 5:
+            raise KeyboardInterrupt
+        return plain(*args)
+
+    monkeypatch.setattr(minari_io, "_to_episode", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        export_dataset(ours, "index-v0")
+    assert not (store / "index-v0").exists()
+    # As a kill leaves it.
+    monkeypatch.setattr(minari, "delete_dataset", lambda dataset_id: None)
+    kept.clear()
+    with pytest.raises(KeyboardInterrupt):
+        export_dataset(ours, "index-v0")
+    with pytest.raises(ValueError, match="`minari delete index-v0` and export it again"):
         import_dataset("index-v0", tmp_path / "back")
     assert not (tmp_path / "back" / "meta.json").exists()
 

@@ -22,6 +22,11 @@ def test_a_flat_looks_like_one(seed):
     assert len(np.unique(scan.orthophoto.reshape(-1, 3), axis=0)) > 5000, "textures"
 
 
+def test_a_flat_takes_no_axis():
+    with pytest.raises(ValueError, match="a flat stands upright, it takes no up; got 'y'"):
+        ScanMap.apartment(0, up="y")
+
+
 def test_seeds_determine_flats():
     one, again, other = (apartment_mesh(seed) for seed in (0, 0, 1))
     assert np.array_equal(one.vertices, again.vertices) and one.vertices.shape != other.vertices.shape

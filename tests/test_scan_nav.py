@@ -267,6 +267,15 @@ def test_distances_against_straight_lines_and_a_corner():
     assert np.isinf(grid.distances(free)[half, half + 30])
 
 
+def test_who_starts_at_the_goal_took_the_shortest_path(room):
+    env = ScanNavVectorEnv(scenes=room, stop="action", autoreset=False)
+    env.reset(seed=0, options={"goal": (4.0, 3.0), "start": (4.0, 3.0)})
+    goal = env.factors()["goal"][0].tolist()
+    env.reset(seed=0, options={"goal": goal, "start": goal})
+    *_, infos = env.step(np.zeros(1, dtype=np.int64))
+    assert env._first_distance[0] == 0 and infos["is_success"][0] and infos["spl"][0] == 1
+
+
 def test_interpolated_distances_are_straight_ones_in_the_open(room):
     env = ScanNavVectorEnv(scenes=room)
     env.reset(seed=0, options={"goal": (4.0, 3.0), "start": (4.0, 2.0)})

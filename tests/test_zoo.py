@@ -114,6 +114,8 @@ def test_frozen_puts_the_encoder_into_the_environment(manager: Any, algo: str, e
         assert saved["vec_env_wrapper"] == [
             {"sb3_abisim.vec_env.VecEncodeObservations": {"encoder": encoder, "objective": objective}}
         ]
+        on_cpu = manager(algo, env_id, word, device="cpu").read_hyperparameters()[0]
+        assert zoo.encoding_kwargs(on_cpu) == {"encoder": encoder, "objective": objective, "device": "cpu"}
         frozen = effective(manager(algo, env_id, word))
         # The network behind the encoder and all else are the same.
         head = {key: value for key, value in kwargs.items() if not key.startswith("features_extractor")}

@@ -15,7 +15,7 @@ from sb3_abisim.benchmark.engine import Engine, make_engine, run_cells
 from sb3_abisim.benchmark.evaluate import evaluate_final
 from sb3_abisim.benchmark.export import INDEX_NAME, export
 from sb3_abisim.benchmark.graph import Cell, Plan, build, run_labels
-from sb3_abisim.collect import import_packages
+from sb3_abisim.collect import add_gym_packages, import_packages
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.zoo import EXTRACTORS
 
@@ -178,7 +178,7 @@ def _evaluate_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folder", metavar="RUN", help="a zoo run folder")
     parser.add_argument("--episodes", type=int, default=100, help="on each split and in each mode (default: 100)")
-    parser.add_argument("--gym-packages", nargs="+", default=[], metavar="MODULE", help="imported to register ids")
+    add_gym_packages(parser)
     return parser
 
 

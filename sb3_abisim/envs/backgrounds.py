@@ -9,6 +9,7 @@ is compared with the sha256 of its manifest when it is first shown. A user's own
 import hashlib
 import json
 import os
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -30,6 +31,8 @@ MEDIA_FOLDER = Path(__file__).resolve().parent.parent / "media"
 _UNITS = 1024
 # Frames between two control points of a camera path.
 _SEGMENT = 32
+# A clip of a user's own keeps its file open, of which a process may have 256 on macOS.
+MAX_OPEN_CLIPS = 200
 # Random numbers used per episode, whatever the clips are.
 N_DRAWS = 3
 
@@ -63,19 +66,19 @@ class Backgrounds:
     :param source: where the clips come from, for reports: "photo_pan" or a path
     :param split: "train" or "eval"
     :param clips: at least one
-    :param skipped: (path, reason) of files that were left out on the user's wish
     """
 
-    def __init__(self, source: str, split: str, clips: Sequence[Clip], skipped: Iterable[tuple[str, str]] = ()) -> None:
+    def __init__(self, source: str, split: str, clips: Sequence[Clip]) -> None:
         assert clips, "a side of the split has at least one clip"
         self.source = source
         self.split = split
         self.clips = tuple(clips)
-        self.skipped = tuple(skipped)
         self.names = tuple(clip.name for clip in clips)
         self.lengths = np.array([clip.length for clip in clips], dtype=np.int64)
         self.clip_ids = np.array([clip.clip_id for clip in clips], dtype=np.int64)
-        self._arrays: list[NDArray[np.uint8] | None] = [None] * len(clips)
+        # Of clips that were shown, the last ones at the end.
+        self._arrays: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
+        self._selected: dict[tuple[str, ...], Backgrounds] = {}
 
     @property
     def n_clips(self) -> int:
@@ -102,7 +105,11 @@ class Backgrounds:
                 f"clips must be distinct names of the {self.split} clips of {self.source}, {problem}; "
                 f"there are {', '.join(self.names)}"
             )
-        return Backgrounds(self.source, self.split, [self.clips[self.names.index(n)] for n in chosen], self.skipped)
+        # One for all environments, as its clips take memory once.
+        if tuple(chosen) not in self._selected:
+            clips = [self.clips[self.names.index(name)] for name in chosen]
+            self._selected[tuple(chosen)] = Backgrounds(self.source, self.split, clips)
+        return self._selected[tuple(chosen)]
 
     def fold(self, clip: NDArray[np.int64], frame: NDArray[np.int64]) -> NDArray[np.int64]:
         """Frame indices within the clips: a clip plays forwards, then backwards, and so on, without repeating its ends.
@@ -125,10 +132,12 @@ class Backgrounds:
         pictures = np.empty((len(clip), *FRAME_SHAPE), dtype=np.uint8)
         rows = zip(clip.tolist(), self.fold(clip, frame).tolist(), strict=True)
         for i, (c, f) in enumerate(rows):
-            array = self._arrays[c]
-            if array is None:
-                array = self._arrays[c] = self._load(c)
-            pictures[i] = array[f]
+            if c not in self._arrays:
+                self._arrays[c] = self._load(c)
+                if len(self._arrays) > MAX_OPEN_CLIPS:
+                    self._arrays.popitem(last=False)
+            self._arrays.move_to_end(c)
+            pictures[i] = self._arrays[c][f]
         return pictures
 
     def _load(self, index: int) -> NDArray[np.uint8]:

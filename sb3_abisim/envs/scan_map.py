@@ -36,7 +36,7 @@ SLICE_DISTANCE = 0.1  # m
 # Pinholes of a scan's floor up to this wide do not stop anyone.
 PINHOLE = 0.06  # m
 # Part of the cache's keys: raise it where the same mesh gives another map.
-_VERSION = 4
+_VERSION = 5
 
 
 @dataclass(frozen=True)
@@ -155,11 +155,13 @@ class ScanMap:
 
         :param seed: determines the flat
         :param cache: whether to look in the cache, and write to it
-        :param settings: those of :class:`MapSettings`
+        :param settings: those of :class:`MapSettings`, without ``up``
         """
         from sb3_abisim.envs.scan_apartment import VERSION, apartment_mesh
 
-        given = _settings({"up": "z", **settings})
+        if "up" in settings:
+            raise ValueError(f"a flat stands upright, it takes no up; got {settings['up']!r}")
+        given = _settings({"up": "z"} | settings)
         key = ["apartment", VERSION, seed]
 
         def make() -> ScanMap:

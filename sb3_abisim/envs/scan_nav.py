@@ -241,7 +241,9 @@ class ScanNavVectorEnv(BatchEnv):
         return self.slack_reward + (before - self._distance) + self.success_reward * self._success, ended
 
     def _infos(self, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-        spl = self._success * self._first_distance / np.maximum(self._first_distance, self._path)
+        longer = np.maximum(self._first_distance, self._path)
+        # Whoever starts at the goal and stays there takes the shortest path.
+        spl = self._success * np.divide(self._first_distance, longer, out=np.ones_like(longer), where=longer > 0)
         return {
             "is_success": self._success.copy(),
             "success": self._success.astype(np.float64),

@@ -158,7 +158,6 @@ def enlarge(
     centre: NDArray[np.float64],
     radius: float,
     scale: int = 8,
-    colour: tuple[int, int, int] = AGENT,
 ) -> NDArray[np.uint8]:
     """A picture for people: the backdrop with sharp, larger pixels and the disc drawn at the larger scale.
 
@@ -166,9 +165,8 @@ def enlarge(
     :param centre: (column, row) of the disc in pixels of the backdrop
     :param radius: in pixels of the backdrop
     :param scale: how many pixels each pixel becomes per side
-    :param colour: of the disc
     :return: shape (size * scale, size * scale, 3), RGB
     """
     large = backdrop.repeat(scale, axis=1).repeat(scale, axis=2).transpose(1, 2, 0)
     alpha = disc_coverage(np.asarray(centre) * scale, radius * scale, len(large))[..., None]
-    return np.rint(large * (1 - alpha) + np.array(colour) * alpha).astype(np.uint8)
+    return np.rint(large * (1 - alpha) + np.array(AGENT) * alpha).astype(np.uint8)

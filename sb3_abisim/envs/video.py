@@ -217,8 +217,8 @@ class _Entry:
         load = partial(_map, self.frames_path)
         return Clip(self.source.name, self.source.group, len(frames), note["sha256"], load)
 
-    def decode(self, max_frames: int) -> None:
-        """Decode the clip into the cache."""
+    def decode(self, max_frames: int, total: int) -> None:
+        """Decode the clip into the cache, up to ``max_frames`` of ``total`` for all clips."""
         source, digest, count = self.source, hashlib.sha256(), 0
 
         def write(file: BinaryIO) -> None:
@@ -226,7 +226,7 @@ class _Entry:
             _write_header(file, 0)
             for image in decode_video(source.path) if source.is_video else _decode_images(source):
                 if count == max_frames:
-                    raise _too_large(f"{source.path} and the clips before it", f"more than {max_frames}", max_frames)
+                    raise _too_large(f"{source.path} and the clips before it", f"more than {total}", total)
                 block = shrink(image).tobytes()
                 digest.update(block)
                 file.write(block)
@@ -303,25 +303,27 @@ def load_split(
     if expected > max_frames:
         raise _too_large(f"the {split} clips of {origin}", expected, max_frames)
     clips: list[Clip] = []
-    skipped: list[tuple[str, str]] = []
+    skipped: list[str] = []
     for entry, cached in _progress(found):
         try:
-            clips.append(_usable(entry, cached, min_frames, max_frames - sum(clip.length for clip in clips)))
+            clips.append(_usable(entry, cached, min_frames, max_frames - sum(c.length for c in clips), max_frames))
         except ClipError as error:
             if on_error == "raise":
                 raise
-            skipped.append((str(entry.source.path), str(error)))
+            skipped.append(str(error))
     if skipped:
-        report = "\n".join(reason for _, reason in skipped)
+        report = "\n".join(skipped)
         if not clips:
             raise ValueError(f"all {len(skipped)} {split} clips of {origin} were skipped:\n{report}")
         warnings.warn(f"skipped {len(skipped)} of {len(entries)} {split} clips:\n{report}", stacklevel=3)
-    return Backgrounds(origin, split, clips, skipped)
+    return Backgrounds(origin, split, clips)
 
 
-def _usable(entry: _Entry, clip: Clip | None, min_frames: int, max_frames: int) -> Clip:
+def _usable(entry: _Entry, clip: Clip | None, min_frames: int, max_frames: int, total: int) -> Clip:
+    if clip is not None and clip.length > max_frames:
+        raise _too_large(f"{entry.source.path} and the clips before it", f"more than {total}", total)
     if clip is None:
-        entry.decode(max_frames)
+        entry.decode(max_frames, total)
         clip = entry.read()
         if clip is None:
             raise OSError(f"{entry.frames_path} does not read back as it was written; check the disk")
