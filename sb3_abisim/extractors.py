@@ -282,7 +282,8 @@ def require_weights(model: BaseAlgorithm) -> None:
 def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> None:
     """Refuse a model whose extractors are not those that ``policy_kwargs`` would build.
 
-    An encoder file that is not there is taken for the model's: a saved model is complete without it.
+    An encoder file that is not there is taken for the model's: a saved model is complete without it. What an extractor
+    of somebody else holds is for that one to check.
 
     :param model: an SB3 model
     :param policy_kwargs: as for a new model
@@ -291,7 +292,9 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
     asked_class = policy_kwargs.get("features_extractor_class")
     kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
     here, digest, absent = "none of our extractors", None, False
-    if isinstance(asked_class, type) and issubclass(asked_class, EncoderExtractor):
+    if asked_class is not None:
+        if not (isinstance(asked_class, type) and issubclass(asked_class, EncoderExtractor)):
+            return
         if issubclass(asked_class, PretrainedExtractor):
             try:
                 digest = load_encoder(kwargs["encoder"]).digest

@@ -79,9 +79,12 @@ def pretrain(
         # Mistakes in its own settings are found before the base is trained.
         stand_in = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
         make_objective(objective, dataset, config, stand_in)
-        # Of the same network, whatever this one is asked to have.
+        # Of the same network and data, whatever this one is asked to have.
         base_config = load_config("ssi", env_id)
-        base_config = dataclasses.replace(base_config, network=config.network, network_kwargs=config.network_kwargs)
+        base_config = dataclasses.replace(
+            base_config, network=config.network, network_kwargs=config.network_kwargs, holdout=config.holdout,
+            batch_size=min(base_config.batch_size, config.batch_size),
+        )  # fmt: skip
         pretrain("ssi", data, base, base_config, None, seed, device, progress_bar, verbose)
     if objective != "abisim" and base is not None:
         raise ValueError(f"a base encoder belongs to 'abisim' alone, got base={base!r} for {objective!r}")
@@ -161,6 +164,10 @@ def parse_overrides(words: list[str]) -> dict[str, Any]:
 
 
 def _number_or_same(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _number_or_same(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_number_or_same(part) for part in value]
     # YAML 1.1 takes 1e-4, without a dot, for a text.
     try:
         return float(value) if isinstance(value, str) else value

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 import platform
-import shlex
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,12 +20,14 @@ from sb3_abisim.checkpoint import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.dataset import Part, TransitionBatch, TransitionDataset
 from sb3_abisim.networks import Encoder, make_encoder
 from sb3_abisim.objectives import OBJECTIVES, Objective, TensorBatch
-from sb3_abisim.pretrain_config import PretrainConfig
+from sb3_abisim.pretrain_config import PretrainConfig, reproducing_commands
 from sb3_abisim.training_state import load_training_state, save_training_state
 
 # From the encoder in evaluation mode to further numbers for a row of the log.
 Callback = Callable[[Encoder], Mapping[str, float]]
 
+# Arguments of an objective that follow from other settings.
+FOLLOWING = {"k", "encoder", "action_space", "base_encoder"}
 N_GOLDEN = 8
 N_STANDARDIZE = 4096
 N_HOLDOUT_BATCHES = 8
@@ -46,7 +47,7 @@ def make_objective(
     objective_class = OBJECTIVES[objective]
     objective_class.check_k(config.k)
     kwargs = dict(config.objective_kwargs)
-    for name in sorted({"k", "encoder", "action_space", "base_encoder"} & kwargs.keys()):
+    for name in sorted(FOLLOWING & kwargs.keys()):
         remedy = f"set k itself: k:{kwargs['k']}" if name == "k" else "it follows from the other settings"
         raise ValueError(f"objective_kwargs.{name} cannot be set; {remedy}")
     if objective_class.reads_action_sequences:
@@ -172,10 +173,13 @@ class PretrainRun:
         """An encoder that has learned nothing looks like any other file."""
         name = "test/accuracy" if self.config.holdout else "train/accuracy"
         accuracy = self.rows[-1].get(name) if self.rows else None
-        chance = self.module.chance_accuracy(self.config.batch_size)
+        batch_size, n = self.config.batch_size, self.config.batch_size * N_HOLDOUT_BATCHES
+        if self.config.holdout:
+            n_test = len(self.dataset.pairs(self.config.k, "test")[0])
+            batch_size, n = min(batch_size, n_test), min(n, n_test)
+        chance = self.module.chance_accuracy(batch_size)
         if accuracy is None or chance is None:
             return
-        n = self.config.batch_size * N_HOLDOUT_BATCHES
         if accuracy <= chance + max(0.005, 3 * math.sqrt(chance * (1 - chance) / n)):
             warnings.warn(
                 f"{self.output}: {name} ended at {accuracy:.3g}, no better than guessing ({chance:.3g}), so the "
@@ -362,28 +366,6 @@ def _device(name: str) -> th.device:
     if not there:
         raise ValueError(f"device {name!r} is not available to this PyTorch; give --device auto or cpu")
     return device
-
-
-def reproducing_commands(settings: dict[str, Any], config: PretrainConfig, meta: dict[str, Any]) -> list[str]:
-    """The commands that make an encoder again, with DATA, BASE and FILE for the paths.
-
-    :param settings: of the run, with objective and seed
-    :param config: its settings by name
-    :param meta: of its dataset
-    """
-    commands = []
-    # Data that was imported has no command that would collect it again.
-    if meta["n_envs"] is not None:
-        collect = ["--env", meta["env_id"], "-n", str(meta["n_transitions"]), "--seed", str(meta["seed"])]
-        collect += ["--n-envs", str(meta["n_envs"]), "-o", "DATA"]
-        if meta["env_kwargs"]:
-            collect += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in meta["env_kwargs"].items())]
-        commands.append(f"python -m sb3_abisim.collect {shlex.join(collect)}")
-    words = ["--objective", settings["objective"], "--env", meta["env_id"], "--seed", str(settings["seed"])]
-    words += ["--data", "DATA", "-o", "FILE"] + (["--base", "BASE"] if "base_digest" in settings else [])
-    words += ["-params", *(f"{name}:{json.dumps(value)}" for name, value in config.as_settings().items())]
-    commands.append(f"python -m sb3_abisim.pretrain {shlex.join(words)}")
-    return commands
 
 
 def _refuse_other_settings(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:

@@ -225,6 +225,9 @@ def _reader(original: Callable[..., Any], zoo_folder: Path) -> Callable[..., Any
             shared = hyperparams.get("env_kwargs", self.env_kwargs)
             shared = {name: value for name, value in shared.items() if name not in ("split", "clips")}
             self.eval_env_kwargs = {"split": "eval", **shared, **(self._eval_env_kwargs_args or {})}
+        elif not self._eval_env_kwargs_args:
+            # rl-zoo3 takes those of --env-kwargs alone, and an environment with other arguments may be another task.
+            self.eval_env_kwargs = hyperparams.get("env_kwargs", self.env_kwargs)
         return hyperparams, saved_hyperparams
 
     return read_hyperparameters
@@ -237,7 +240,7 @@ def _prepare_embeddings(hyperparams: dict[str, Any], device: Any) -> None:
     # A copy: config.yml names the device as little as it does for the rest of the run.
     hyperparams["vec_env_wrapper"] = copy.deepcopy(hyperparams["vec_env_wrapper"])
     (encoding_kwargs(hyperparams) or {}).setdefault("device", str(device))
-    if _normalizes_observations(hyperparams.get("normalize", False)):
+    if normalizes_observations(hyperparams.get("normalize", False)):
         raise ValueError(
             f"normalize={hyperparams['normalize']!r} would change the embeddings of the frozen encoder; give "
             '"dict(norm_obs=False, norm_reward=True)"'
@@ -261,11 +264,15 @@ def _agent_loader(original: Callable[..., Any]) -> Callable[..., Any]:
     return _load_pretrained_agent
 
 
-def _normalizes_observations(normalize: Any) -> bool:
-    """Whether the zoo's ``normalize`` (a bool, or the text of a dictionary) makes VecNormalize change observations."""
+def normalizes_observations(normalize: Any) -> bool:
+    """Whether the zoo's ``normalize`` makes VecNormalize change observations.
+
+    :param normalize: of a zoo entry: a bool, a dictionary, or the text of either
+    """
     if isinstance(normalize, dict):
         return bool(normalize.get("norm_obs", True))
-    return bool(normalize) and re.search(r"norm_obs['\"]?\s*[=:]\s*False", str(normalize)) is None
+    text = str(normalize or False)
+    return text not in ("False", "None") and re.search(r"norm_obs['\"]?\s*[=:]\s*False", text) is None
 
 
 def _test_env_maker(original: Callable[..., Any]) -> Callable[..., Any]:

@@ -70,6 +70,14 @@ def test_the_base_encoder_reaches_those_that_rest_on_it() -> None:
     assert len(titles) == 8 + 16, "both encoders of each seed and environment, their runs and the evaluations"
 
 
+@pytest.mark.parametrize(
+    "word", ["objective_kwargs.c:0.9", "abisim.objective_kwargs.cc:0.9", "ssi.objective_kwargs.k:3"]
+)
+def test_unknown_settings_of_an_objective_are_refused_before_anything_runs(word: str) -> None:
+    with pytest.raises(ValueError, match=r"(ssi|abisim) has no objective_kwargs\.(c|cc|k), only .*l1_penalty"):
+        build(dataclasses.replace(PLAN, pretrain_params=(word,)))
+
+
 def test_the_commands_carry_the_settings() -> None:
     plan = dataclasses.replace(
         PLAN, methods=("abisim,frozen",), env_ids=("Nav2D-v0",), n_timesteps=500, eval_freq=50, params=("gamma:0.9",),

@@ -35,6 +35,12 @@ def test_a_node_of_another_version_or_without_the_folder_is_refused(tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+def test_no_cells_at_a_time_are_refused() -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(ValueError, match="n_jobs must be at least 1, got 0"):
+        RayEngine(n_jobs=0)
+
+
 @pytest.mark.slow
 def test_a_killed_node_costs_its_cell_another_start_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -65,6 +71,8 @@ def test_a_killed_node_costs_its_cell_another_start_and_nothing_else(
     list_running: list[Cell] = []
     try:
         cells = build(PLAN)
+        with pytest.raises(ValueError, match=r"no node has room for a cell of 2 processors and 0\.0 GPUs"):
+            RayEngine(threads=2, address=cluster.address)
         engine = KillingEngine(address=cluster.address)
         assert engine.n_slots == 2
         assert run_cells(tmp_path, cells, engine, progress=False) == {}

@@ -268,6 +268,15 @@ def test_training_episodes_as_source(tmp_path: Path) -> None:
     text = (tmp_path / "report" / "index.html").read_text()
     assert "the training episodes themselves" in text and "Evaluation is deterministic" not in text
     assert "No aggregates across environments" in text
+    # Two evaluations are there, and what exploring brought is not what the most likely action does.
+    comparison = compare([str(tmp_path)], source="training")
+    assert [(row["mode"], row["split"], row["mean"]) for row in comparison.final] == [
+        ("deterministic", "last evaluation", -50.0)
+    ]
+    assert "PointMaze-v0: abisim has no final evaluation; its last evaluation is shown." in comparison.notes
+    (moved / "evaluations.npz").unlink()
+    (row,) = compare([str(tmp_path)], source="training").final
+    assert (row["mode"], row["split"], row["paper"]) == ("sampled", "end of training", None) and row["mean"] > -10
 
 
 def test_an_end_where_nothing_was_learnt_is_said_to_be_one(tmp_path: Path) -> None:

@@ -93,6 +93,7 @@ def test_a_longer_baseline_makes_the_bound_closer(reference: list, baseline: lis
 
 
 def test_no_ratio_without_arrivals_or_interval_without_runs() -> None:
+    assert statistics.steps_ratio(np.array([100, np.nan]), np.array([1600, np.nan]), (1000, 4000)).steps == (550, 1000)
     nobody = statistics.steps_ratio(np.full(3, np.nan), np.full(3, np.nan), (1000, 1000))
     assert np.isnan(nobody.value) and nobody.reached == (0, 0)
     single = statistics.steps_ratio(np.array([100.0]), np.array([400.0, 300.0]), (1000, 1000))

@@ -188,6 +188,7 @@ def test_a_trial_that_fails_is_no_end(
     [
         (["--space", "c"], "a part of the search space is"),
         (["--space", "holdout=0.5..1.5"], "holdout must lie in .* got 1.5"),
+        (["--space", "objective_kwargs.gamma=1..2"], r"abisim has no objective_kwargs\.gamma"),
         (["--space", "no_setting=1..2"], "unknown pretraining setting no_setting"),
         (["--space", *SPACE, "--method", "vanilla"], "a sweep pretrains one of ssi, .* got 'vanilla'"),
         (["--space", *SPACE, "--method", "abisim=FILE"], "a sweep pretrains one of ssi, .* got 'abisim=FILE'"),

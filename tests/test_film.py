@@ -117,6 +117,8 @@ def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message)
         ({"vec_env_wrapper": [{"some.VecWrapper": {"n": 1}}]}, "some.VecWrapper"),
         ({"normalize": "dict(norm_obs=False, norm_reward=True)"}, None),
         ({"normalize": "{'norm_obs': False}"}, None),
+        ({"normalize": {"norm_obs": False}}, None),
+        ({"normalize": "False"}, None),
         ({"vec_env_wrapper": [{"sb3_abisim.vec_env.VecEncodeObservations": {"encoder": "e"}}]}, None),
     ],
 )

@@ -227,12 +227,19 @@ def test_command_line_mistakes_exit_2(data, tmp_path, capsys, arguments, message
     assert not list(tmp_path.glob("*.safetensors"))
 
 
-def test_too_little_to_hold_out_is_told_at_once(tmp_path):
+def test_too_little_to_hold_out_is_told_at_once(tmp_path, monkeypatch):
     collect(["--env", "Nav2D-v0", "-n", "12", "-o", str(tmp_path / "data"), "--n-envs", "1"])
     with pytest.raises(ValueError, match=r"no segment held out of .*data .holdout 0.05. .* or set holdout:0"):
         run(tmp_path / "data", tmp_path / "abisim.safetensors", "abisim", batch_size=4)
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
-    assert run(tmp_path / "data", tmp_path / "abisim.safetensors", batch_size=4, holdout=0.0).is_file()
+    assert run(tmp_path / "data", tmp_path / "ssi.safetensors", batch_size=8, holdout=0.0).is_file()
+    # The base is trained on the same part, in batches that are no larger.
+    config = load_config("abisim", "Nav2D-v0", {**SETTINGS, "batch_size": 8, "holdout": 0.0})
+    base = load_config("ssi", "Nav2D-v0", {**SETTINGS, "n_updates": 3})
+    monkeypatch.setattr("sb3_abisim.pretrain.load_config", lambda *args: base)
+    pretrain("abisim", tmp_path / "data", tmp_path / "abisim.safetensors", config, device="cpu", progress_bar=False)
+    settings = load_encoder(tmp_path / "abisim.base.safetensors").contract["settings"]
+    assert (settings["batch_size"], settings["holdout"]) == (8, 0.0)
 
 
 def test_numbers_without_a_dot(data, tmp_path):
@@ -242,6 +249,10 @@ def test_numbers_without_a_dot(data, tmp_path):
     words = ["learning_rate:1e-4", "objective_kwargs.l1_penalty:2e-3", "learning_rate:lin_1e-3"]
     assert parse_overrides(words[:2]) == {"learning_rate": 1e-4, "objective_kwargs.l1_penalty": 2e-3}
     assert parse_overrides(words[2:]) == {"learning_rate": "lin_1e-3"}
+    # As a card's commands write them.
+    assert parse_overrides(['objective_kwargs:{"a": 5e-05, "b": [1e-4, "x"]}']) == {
+        "objective_kwargs": {"a": 5e-5, "b": [1e-4, "x"]}
+    }
 
 
 def test_folder_of_someone_else(tmp_path, capsys):

@@ -9,12 +9,15 @@ import gymnasium as gym
 import pytest
 import torch as th
 import yaml
+from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 from zoo_inputs import SMALL, write_encoder
 
 from sb3_abisim import zoo
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.extractors import VanillaExtractor, check_trained_with
 from sb3_abisim.resources import resource_path
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
@@ -269,6 +272,37 @@ def test_a_run_goes_on_with_its_own_encoder_or_not_at_all(manager: Any, tmp_path
     experiment("vanilla").save(agent)
     with pytest.raises(ValueError, match="was trained with VanillaExtractor, not with SSIExtractor"):
         experiment(mine, agent)
+
+
+def test_evaluation_is_in_the_environment_of_training(manager: Any) -> None:
+    """rl-zoo3 gives it the arguments of --env-kwargs, not those among the hyperparameters."""
+    chosen = {"hyperparams": {"env_kwargs": {"max_episode_steps": 20}}}
+    for expected, given in (
+        ({"max_episode_steps": 20}, {}),
+        ({"max_episode_steps": 9}, {"eval_env_kwargs": {"max_episode_steps": 9}}),
+    ):
+        made = manager("ppo", "Nav2D-v0", "ssi", **chosen, **given)
+        made.read_hyperparameters()
+        assert made.eval_env_kwargs == expected
+    plain = manager("ppo", "Nav2D-v0", "ssi", env_kwargs={"max_episode_steps": 7})
+    plain.read_hyperparameters()
+    assert plain.eval_env_kwargs == {"max_episode_steps": 7}
+
+
+def test_extractors_of_somebody_else_may_hold_ours() -> None:
+    class Own(BaseFeaturesExtractor):
+        def __init__(self, space: gym.Space) -> None:
+            super().__init__(space, 576)
+            self.picture = VanillaExtractor(space)
+
+        def forward(self, observations: th.Tensor) -> th.Tensor:
+            return self.picture(observations)
+
+    kwargs = {"features_extractor_class": Own}
+    model = PPO("CnnPolicy", "Nav2D-v0", n_steps=8, batch_size=8, policy_kwargs=kwargs, device="cpu")
+    check_trained_with(model, kwargs)
+    with pytest.raises(ValueError, match="trained with VanillaExtractor, not with none of our extractors"):
+        check_trained_with(model, {})
 
 
 def test_an_own_environment_with_normalised_embeddings_is_refused(manager: Any, tmp_path: Path) -> None:

@@ -67,6 +67,7 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
     pictures = results["pictures"]
     rows = list(next(iter(pictures.values())))
     columns = [(setting, k) for setting, frames in pictures.items() for k in range(len(frames["query"]))]
+    unit = "cells" if results["env_id"].startswith("Nav2D") else "m"
     figure, axes = plt.subplots(
         len(rows), len(columns), figsize=(1.2 * len(columns) + 0.4, 1.5 * len(rows) + 0.5), constrained_layout=True
     )
@@ -80,13 +81,13 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
                 continue
             example = results["settings"][setting][name]["examples"]
             clip = "" if not example["same_clip"] else ("same clip" if example["same_clip"][k] else "other clip")
-            axis.set_title(f"d {example['distance'][k]:.2f}, {example['agent'][k]:.1f} m\n{clip}", fontsize=6)
+            axis.set_title(f"d {example['distance'][k]:.2f}, {example['agent'][k]:.1f} {unit}\n{clip}", fontsize=6)
         row[0].set_ylabel(name.rsplit("/", 1)[-1].removesuffix(".safetensors"), fontsize=7)
     # One setting makes a narrow figure.
     gap = "\n" if len(pictures) == 1 else " "
     figure.suptitle(
         f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings,{gap}1 is the mean of "
-        "all neighbours; m: distance of the agents)",
+        f"all neighbours; {unit}: distance of the agents)",
         fontsize=8,
     )
     save(figure, path)

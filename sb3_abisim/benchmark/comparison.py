@@ -57,12 +57,19 @@ class Group:
         """Returns as shares of the way from ``low`` to ``high``."""
         return (returns - self.low) / (self.high - self.low)
 
-    def last(self) -> Floats:
-        """Return of each final model with the most likely action; of the last evaluations if a run has no final one."""
+    def last(self) -> tuple[str, Floats]:
+        """Return of each final model with the most likely action.
+
+        :return: mode and split, ``mode/split``, and the returns; of the last evaluations if a run has no final one, of
+            the end of training if it has none of those either
+        """
         for name in ("deterministic/eval", "deterministic/standard"):
             if all(name in final for final in self.finals):
-                return np.array([final[name] for final in self.finals])
-        return np.array([curve.returns[-1] for curve in self.curves])
+                return name, np.array([final[name] for final in self.finals])
+        try:
+            return "deterministic/last evaluation", np.array([run.evaluations().returns[-1] for run in self.runs])
+        except ValueError:
+            return "sampled/end of training", np.array([curve.returns[-1] for curve in self.curves])
 
     def end(self) -> float:
         """Mean over runs of where their curves end, as :func:`~statistics.steps_to_threshold` measures arrival."""
@@ -137,7 +144,7 @@ def compare(
     labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
     aggregates, profiles, improvement = _across(groups, labels, reference, seed, notes)
     return Comparison(
-        groups, reference, source, _curve_rows(groups), _final_rows(groups),
+        groups, reference, source, _curve_rows(groups), _final_rows(groups, notes),
         _threshold_rows(groups, reference, thresholds, seed, notes), aggregates, profiles, improvement, notes,
     )  # fmt: skip
 
@@ -252,14 +259,17 @@ def _curve_rows(groups: dict[str, dict[str, Group]]) -> list[Row]:
     return rows
 
 
-def _final_rows(groups: dict[str, dict[str, Group]]) -> list[Row]:
+def _final_rows(groups: dict[str, dict[str, Group]], notes: list[str]) -> list[Row]:
     rows = []
     for env_id, methods in groups.items():
         for label, group in methods.items():
             names = sorted(set.intersection(*(set(final) for final in group.finals)))
             values = {name: np.array([final[name] for final in group.finals]) for name in names}
             if not values:
-                values = {"deterministic/last evaluation": group.last()}
+                values = dict([group.last()])
+                notes.append(
+                    f"{env_id}: {label} has no final evaluation; its {next(iter(values)).split('/')[1]} is shown."
+                )
             for name, returns in values.items():
                 mode, split = name.split("/")
                 mean, half = statistics.mean_and_interval(returns)
@@ -306,8 +316,7 @@ def _threshold_rows(
                 rows.append(
                     {"env_id": env_id, "threshold": threshold, "return": level, "baseline": label,
                      "ratio": ratio.value, "low": ratio.low, "high": ratio.high, "bound": ratio.bound,
-                     "steps_reference": float(np.nan_to_num(steps[reference], nan=pair[0]).mean()),
-                     "steps_baseline": float(np.nan_to_num(steps[label], nan=pair[1]).mean()),
+                     "steps_reference": ratio.steps[0], "steps_baseline": ratio.steps[1],
                      "reached_reference": int((~np.isnan(steps[reference])).sum()),
                      "reached_baseline": int((~np.isnan(steps[label])).sum()),
                      "n_reference": len(steps[reference]), "n_baseline": len(steps[label]),
@@ -330,11 +339,13 @@ def _across(
         return [], [], []
     if len(shared) < len(groups):
         notes.append(f"Aggregates are over {', '.join(shared)}: the other environments lack runs of some method.")
+    if any(len(groups[env_id][label].runs) > counts[label] for env_id in shared for label in labels):
+        notes.append("Aggregates take as many runs of a method as it has in each environment, the first ones by seed.")
     finals, areas = {}, {}
     for label in labels:
         members = [groups[env_id][label] for env_id in shared]
         n = counts[label]
-        finals[label] = np.stack([group.normalised(group.last())[:n] for group in members], axis=1)
+        finals[label] = np.stack([group.normalised(group.last()[1])[:n] for group in members], axis=1)
         areas[label] = np.stack(
             [group.normalised(_areas(group, groups[group.env_id]))[:n] for group in members], axis=1
         )

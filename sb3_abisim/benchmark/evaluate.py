@@ -7,7 +7,6 @@ mazes.
 """
 
 import io
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from sb3_abisim.benchmark.runs import Run, read_run
 from sb3_abisim.checkpoint import RUN_COPY
 from sb3_abisim.frozen import fuse
 from sb3_abisim.vec_env import EncodedBox, VecEncodeObservations
-from sb3_abisim.zoo import DISTRACTOR_IDS
+from sb3_abisim.zoo import DISTRACTOR_IDS, normalizes_observations
 
 FILE_NAME = "final_evaluations.npz"
 SPLITS = ("eval", "train", "clean")
@@ -98,9 +97,8 @@ def not_rebuilt(settings: Mapping[str, Any]) -> list[str]:
     :return: names of wrappers; empty where the final evaluation is as training was
     """
     found = [name for name in ("env_wrapper", "frame_stack") if settings.get(name)]
-    # True or rl-zoo3's "dict(...)"; normalised rewards change nothing of what a model sees.
-    normalize = str(settings.get("normalize") or "norm_obs=False")
-    found += ["normalize"] if not re.search(r"norm_obs['\"]?\s*[=:]\s*False", normalize) else []
+    # Normalised rewards change nothing of what a model sees.
+    found += ["normalize"] if normalizes_observations(settings.get("normalize")) else []
     wrappers = settings.get("vec_env_wrapper") or []
     for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
         name = next(iter(wrapper)) if isinstance(wrapper, dict) else str(wrapper)

@@ -22,8 +22,10 @@ from sb3_abisim._version import __version__
 from sb3_abisim.benchmark.evaluate import SPLITS, not_rebuilt
 from sb3_abisim.checkpoint import load_encoder
 from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.objectives import OBJECTIVES
 from sb3_abisim.pretrain import OBJECTIVE_NAMES, parse_overrides
 from sb3_abisim.pretrain_config import load_config
+from sb3_abisim.pretrain_run import FOLLOWING
 from sb3_abisim.zoo import DISTRACTOR_IDS, UNTRAINED, Method, hyperparameters_file
 
 ALGOS = ("ppo", "dqn", "sac")
@@ -214,6 +216,12 @@ def encoder_cell(plan: Plan, env_id: str, objective: str, seed: int) -> Cell:
         inputs += (encoder_cell(plan, env_id, "ssi", seed),)
     words = _params_of(plan.pretrain_params, objective, OBJECTIVE_NAMES)
     config = load_config(objective, env_id, parse_overrides(words))
+    settable = inspect.signature(OBJECTIVES[objective]).parameters.keys() - FOLLOWING
+    for unknown in sorted(config.objective_kwargs.keys() - settable):
+        raise ValueError(
+            f"{objective} has no objective_kwargs.{unknown}, only {', '.join(sorted(settable))}; a setting of another "
+            f"objective has its name in front: --pretrain-params OBJECTIVE.objective_kwargs.{unknown}:VALUE"
+        )
     settings = {"objective": objective, "env_id": env_id, "seed": seed, **config.as_settings()}
     output = f"encoders/{env_id}/{objective}-{_key('encoder', settings, inputs)[:8]}.safetensors"
     command = ["sb3_abisim.pretrain", "--objective", objective, "--env", env_id, "--data", inputs[0].output]

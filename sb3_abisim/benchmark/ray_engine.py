@@ -38,17 +38,21 @@ class RayEngine:
             import ray
         except ImportError as error:
             raise ValueError("Ray is not installed; run: pip install 'sb3_abisim[distributed]'") from error
+        if n_jobs is not None and n_jobs < 1:
+            raise ValueError(f"n_jobs must be at least 1, got {n_jobs}")
         self._ray = ray
         try:
             ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
         except ConnectionError as error:
             raise ValueError(f"no Ray cluster at {address!r} ({error}); start one with: ray start --head") from error
-        resources: dict[str, float] = ray.cluster_resources()
-        room = int(resources.get("CPU", 0) // threads)
-        room = min(room, int(resources.get("GPU", 0) / gpus)) if gpus else room
+        nodes: list[dict[str, float]] = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        room = 0
+        for node in nodes:  # a cell does not lie on two
+            fitting = int(node.get("CPU", 0) // threads)
+            room += min(fitting, int(node.get("GPU", 0) / gpus)) if gpus else fitting
         if room < 1:
             ray.shutdown()
-            raise ValueError(f"the cluster has no room for a cell of {threads} processors and {gpus} GPUs: {resources}")
+            raise ValueError(f"no node has room for a cell of {threads} processors and {gpus} GPUs: {nodes}")
         self.n_slots, self.threads = room if n_jobs is None else n_jobs, threads
         self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": retries}
 

@@ -73,6 +73,7 @@ class Ratio:
     :param bound: "" when all runs arrived; "<=" when runs of the baseline alone did not, so that the true ratio is
         smaller; ">=" when runs of the reference alone did not; "~" when runs of both did not
     :param reached: share of the runs that arrived, of the reference and of the baseline
+    :param steps: the mean steps of the reference and of the baseline
     """
 
     value: float
@@ -80,6 +81,7 @@ class Ratio:
     high: float
     bound: str
     reached: tuple[float, float]
+    steps: tuple[float, float]
 
 
 def steps_ratio(reference: Floats, baseline: Floats, horizons: tuple[int, int], seed: int = 0) -> Ratio:
@@ -94,7 +96,7 @@ def steps_ratio(reference: Floats, baseline: Floats, horizons: tuple[int, int], 
     bound = {(False, False): "", (False, True): "<=", (True, False): ">=", (True, True): "~"}[missed]
     reached = float(1 - np.isnan(reference).mean()), float(1 - np.isnan(baseline).mean())
     if not any(reached):
-        return Ratio(float("nan"), float("nan"), float("nan"), bound, reached)
+        return Ratio(float("nan"), float("nan"), float("nan"), bound, reached, horizons)
     # Where one arrives, longer runs of the other make a closer bound; where neither does, they feign a difference.
     limits = (min(horizons),) * 2 if all(missed) else horizons
     a, b = (
@@ -106,7 +108,8 @@ def steps_ratio(reference: Floats, baseline: Floats, horizons: tuple[int, int], 
         rng = np.random.default_rng(seed)
         means = [x[rng.integers(len(x), size=(N_RESAMPLES, len(x)))].mean(axis=1) for x in (a, b)]
         low, high = np.quantile(means[0] / means[1], [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]).tolist()
-    return Ratio(float(a.mean() / b.mean()), low, high, bound, reached)
+    steps = float(a.mean()), float(b.mean())
+    return Ratio(steps[0] / steps[1], low, high, bound, reached, steps)
 
 
 def area_under_curve(steps: NDArray[np.int64], values: Floats) -> Floats:

@@ -134,7 +134,7 @@ def sweep(
     distributions = parse_space(space, objective)
     for name, distribution in distributions.items():
         for value in _extremes(distribution):
-            # Raises for a setting that is not there, or cannot be that.
+            # Raises for a setting that is not there.
             build(dataclasses.replace(plan, pretrain_params=(*plan.pretrain_params, f"{name}:{value}")))
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.TPESampler(seed=seed))
