@@ -213,6 +213,21 @@ def test_an_export_that_is_stopped_leaves_nothing_or_nothing_that_is_taken_for_w
     with pytest.raises(ValueError, match="`minari delete index-v0` and export it again"):
         import_dataset("index-v0", tmp_path / "back")
     assert not (tmp_path / "back" / "meta.json").exists()
+    # After the last episode, before the sum over all of them.
+    storage = type(minari.load_dataset("index-v0").storage)
+    original = storage.update_metadata
+
+    def update_metadata(self: object, metadata: dict) -> None:
+        if metadata.get(minari_io.METADATA_KEY, {}).get("content_sha256"):
+            raise KeyboardInterrupt
+        original(self, metadata)
+
+    monkeypatch.setattr(storage, "update_metadata", update_metadata)
+    monkeypatch.setattr(minari_io, "_to_episode", plain)
+    with pytest.raises(KeyboardInterrupt):
+        export_dataset(ours, "whole-v0")
+    with pytest.raises(ValueError, match=r"was not exported to its end; .*`minari delete whole-v0`"):
+        import_dataset("whole-v0", tmp_path / "other")
 
 
 def change_metadata(store: Path, dataset_id: str, **changes: object) -> None:

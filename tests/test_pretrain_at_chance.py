@@ -48,7 +48,7 @@ def test_guessing_among_the_keys_that_are_held_out(data, tmp_path):
     # A hundred or so: one in their number is far more than one in 256.
     config = load_config("curl", "Nav2D-v0", {**SETTINGS, "batch_size": 256})
     pretraining = PretrainRun("curl", TransitionDataset(data), tmp_path / "x.safetensors", config, None, 0, "cpu")
-    pretraining.rows = [{"n_updates": 10, "test/accuracy": 0.02}]
+    pretraining.rows = [{"n_updates": 10, "test/accuracy": 0.03}]
     with pytest.warns(UserWarning, match="no better than guessing"):
         pretraining._warn_at_chance()
 

@@ -215,16 +215,24 @@ class TestMistakes:
         with pytest.raises(ValueError, match=r"have 64 frames, but max_bytes allows 63 .*larger max_bytes"):
             load_backgrounds(folder, max_bytes=64 * 12288 - 1)
 
-    def test_too_large_without_a_count_in_the_header(self, folder, monkeypatch):
+    def test_too_large_without_a_count_in_the_header(self, folder, cache, monkeypatch):
         write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)
         monkeypatch.setattr(video, "_promise", lambda container, path: (None, 0.0))
         with pytest.raises(ValueError, match=r"more than 63 frames, but max_bytes allows 63"):
             load_backgrounds(folder, max_bytes=64 * 12288 - 1)
-        # Two on one side: the limit is that of all of them, in the message too, whether they are in the cache or not.
+        # More on one side: the limit is that of all of them, in the message too, whether they are in the cache or not.
         write_video(folder / "c.mp4", 3), write_video(folder / "d.mp4", 4)
         for _ in range(2):
             with pytest.raises(ValueError, match=r"the clips before it have more than 100 frames, but .* allows 100 "):
                 load_backgrounds(folder, max_bytes=100 * 12288)
+        # The first anew, with a length that is not known yet, and the next from the cache.
+        names = load_backgrounds(folder).names
+        assert len(names) == 3
+        video.load_split.cache_clear()
+        (note,) = [path for path in cache.glob("*.json") if f"{names[0]}.mp4" in path.read_text()]
+        note.unlink()
+        with pytest.raises(ValueError, match=r"the clips before it have more than 100 frames, but .* allows 100 "):
+            load_backgrounds(folder, max_bytes=100 * 12288)
         for path in folder.glob("[cd].mp4"):
             path.unlink()
         assert load_backgrounds(folder, max_bytes=64 * 12288).lengths.tolist() == [64]
