@@ -229,7 +229,7 @@ class TestMistakes:
         names = load_backgrounds(folder).names
         assert len(names) == 3
         video.load_split.cache_clear()
-        (note,) = [path for path in cache.glob("*.json") if f"{names[0]}.mp4" in path.read_text()]
+        (note,) = [path for path in cache.glob("*.json") if f"/{names[0]}" in path.read_text()]
         note.unlink()
         with pytest.raises(ValueError, match=r"the clips before it have more than 100 frames, but .* allows 100 "):
             load_backgrounds(folder, max_bytes=100 * 12288)
