@@ -231,8 +231,8 @@ class TestMistakes:
         video.load_split.cache_clear()
         (note,) = [path for path in cache.glob("*.json") if f"/{names[0]}" in path.read_text()]
         note.unlink()
-        with pytest.raises(ValueError, match=r"the clips before it have more than 100 frames, but .* allows 100 "):
-            load_backgrounds(folder, max_bytes=100 * 12288)
+        with pytest.raises(ValueError, match=r"the clips before it have more than 150 frames, but .* allows 150 "):
+            load_backgrounds(folder, max_bytes=150 * 12288)
         for path in folder.glob("[cd].mp4"):
             path.unlink()
         assert load_backgrounds(folder, max_bytes=64 * 12288).lengths.tolist() == [64]
