@@ -1,8 +1,10 @@
-"""Where the files that come with the package lie: encoders and hyperparameters."""
+"""Where files lie: those that come with the package, encoders and hyperparameters, and those that it keeps."""
 
+import os
 from pathlib import Path
 from typing import Literal
 
+CACHE_VARIABLE = "SB3_ABISIM_CACHE"
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -18,3 +20,15 @@ def resource_path(kind: Literal["encoders", "hyperparams"]) -> Path:
         raise ValueError(f"kind must be 'encoders' or 'hyperparams', got {kind!r}")
     installed = _PACKAGE / kind
     return installed if installed.is_dir() else _PACKAGE.parent / kind
+
+
+def cache_folder(kind: str = "") -> Path:
+    """Where what takes long to make is kept.
+
+    :param kind: a folder within the user's cache folder
+    :return: ``$SB3_ABISIM_CACHE`` if it is set, else ``sb3_abisim/<kind>`` in the user's cache folder; it need not exist
+    """
+    chosen = os.environ.get(CACHE_VARIABLE)
+    if chosen:
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_abisim" / kind

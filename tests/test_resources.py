@@ -8,7 +8,7 @@ import pytest
 
 from sb3_abisim import checkpoint, resources
 from sb3_abisim.checkpoint import EncoderNotFoundError, resolve_encoder
-from sb3_abisim.resources import resource_path
+from sb3_abisim.resources import cache_folder, resource_path
 
 
 def test_resolve_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,3 +63,12 @@ def test_resource_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert resource_path("encoders") == tmp_path / "site" / "encoders"
     with pytest.raises(ValueError, match="'models'"):
         resource_path("models")  # type: ignore[arg-type]
+
+
+def test_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/kept/here")
+    for empty in (True, False):
+        monkeypatch.setenv("SB3_ABISIM_CACHE", "") if empty else monkeypatch.delenv("SB3_ABISIM_CACHE")
+        assert cache_folder("scans") == Path("/kept/here/sb3_abisim/scans") and cache_folder().name == "sb3_abisim"
+    monkeypatch.setenv("SB3_ABISIM_CACHE", "/chosen")
+    assert cache_folder("scans") == cache_folder() == Path("/chosen")

@@ -15,6 +15,7 @@ from sb3_abisim.envs import scan_map
 from sb3_abisim.envs.scan_files import SceneError
 from sb3_abisim.envs.scan_map import ScanMap, find_floors
 from sb3_abisim.envs.scan_mesh import load_mesh
+from sb3_abisim.resources import cache_folder
 
 
 def at(scan, x, y):
@@ -202,16 +203,10 @@ def test_the_cache_is_used_and_notices_changes(tmp_path, monkeypatch):
     image = next(file for file in tmp_path.iterdir() if file.suffix == ".png")
     Image.new("RGB", (8, 8), (1, 2, 3)).save(image)
     assert ScanMap.from_mesh(path).fingerprint != first.fingerprint and len(calls) == 2, "another texture"
-    for kept in scan_map.cache_folder().iterdir():
+    for kept in cache_folder("scans").iterdir():
         kept.write_bytes(b"damaged")
     ScanMap.from_mesh(path)
     assert len(calls) == 3
-
-
-def test_an_empty_variable_is_none(monkeypatch):
-    monkeypatch.setenv("SB3_ABISIM_CACHE", "")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/kept/here")
-    assert str(scan_map.cache_folder()) == "/kept/here/sb3_abisim/scans"
 
 
 def glb_with(**header):

@@ -24,6 +24,7 @@ from sb3_abisim.atomic import file_digest, write_atomic
 from sb3_abisim.envs.scan_files import SceneError
 from sb3_abisim.envs.scan_mesh import LEVEL_BIN, ScanMesh, level_areas, load_mesh, warn_missing
 from sb3_abisim.envs.scan_raster import Nearest, contour_pixels, fragments, shade
+from sb3_abisim.resources import CACHE_VARIABLE, cache_folder
 
 FORMAT = "sb3_abisim scan map 1"
 MAX_PIXELS = 64_000_000
@@ -233,17 +234,9 @@ def _settings(settings: dict[str, Any]) -> MapSettings:
         raise ValueError(f"{error}; the settings of a map are {known}") from error
 
 
-def cache_folder() -> Path:
-    """Where maps are kept: ``$SB3_ABISIM_CACHE``, or ``sb3_abisim/scans`` in the user's cache folder."""
-    chosen = os.environ.get("SB3_ABISIM_CACHE")
-    if chosen:
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_abisim" / "scans"
-
-
 def _cached(key: list[Any], settings: MapSettings, make: Callable[[], ScanMap], folder: Path) -> ScanMap:
     text = json.dumps([_VERSION, FORMAT, key, vars(settings)])
-    path = cache_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
+    path = cache_folder("scans") / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
     try:
         kept = ScanMap.load(path)
     except SceneError:
@@ -257,7 +250,7 @@ def _cached(key: list[Any], settings: MapSettings, make: Callable[[], ScanMap], 
         made.save(path)
     except OSError as error:
         warnings.warn(
-            f"cannot keep the map of {made.source} ({error}); set SB3_ABISIM_CACHE to a folder that can be written",
+            f"cannot keep the map of {made.source} ({error}); set {CACHE_VARIABLE} to a folder that can be written",
             stacklevel=4,
         )
     return made

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from sb3_abisim.atomic import file_digest, write_atomic
 from sb3_abisim.envs.backgrounds import FRAME_SHAPE, SIZE, Backgrounds, Clip, digest_of
 from sb3_abisim.envs.video_files import Source
+from sb3_abisim.resources import CACHE_VARIABLE, cache_folder
 
 if TYPE_CHECKING:
     from PIL import Image
 
-CACHE_VARIABLE = "SB3_ABISIM_CACHE"
 
 _BYTES_PER_FRAME = 3 * SIZE * SIZE
 # Raise it when the decoding changes, so that older cache entries are not used.
@@ -163,14 +163,6 @@ def _import_decoder(module: str) -> Any:
 
 
 # The cache.
-
-
-def cache_folder() -> Path:
-    """Where decoded clips are kept: ``$SB3_ABISIM_CACHE``, else ``sb3_abisim`` in the user's cache folder."""
-    chosen = os.environ.get(CACHE_VARIABLE)
-    if chosen:
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_abisim"
 
 
 def _make_cache(folder: Path) -> None:
