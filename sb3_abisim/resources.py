@@ -26,7 +26,7 @@ def cache_folder(kind: str = "") -> Path:
     """Where what takes long to make is kept.
 
     :param kind: a folder within the user's cache folder
-    :return: ``$SB3_ABISIM_CACHE`` if it is set, else ``sb3_abisim/<kind>`` in the user's cache folder; it need not exist
+    :return: ``$SB3_ABISIM_CACHE`` if it is set, else ``sb3_abisim/<kind>`` in the user's cache folder; may be absent
     """
     chosen = os.environ.get(CACHE_VARIABLE)
     if chosen:
