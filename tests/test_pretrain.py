@@ -96,7 +96,9 @@ def test_a_file_in_the_place_of_the_card_is_not_replaced(data, tmp_path, content
 
 def test_what_kills_left_goes(data, tmp_path):
     output = run(data, tmp_path / "ssi.safetensors", "ssi")
-    left = [tmp_path / "ssi.run" / name for name in ("checkpoint-000000003.safetensors", ".checkpoint-1.abc.tmp")]
+    left = [
+        tmp_path / "ssi.run" / name for name in ("checkpoint-000000003.safetensors", f".checkpoint-1.{'0a' * 8}.tmp")
+    ]
     for path in left:
         path.write_bytes(b"")
     run(data, output, "ssi")
