@@ -358,3 +358,17 @@ def test_a_settings_file_cannot_run_code(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"cannot read .*args\.yml"):
         read_run(run)
     assert not witness.exists()
+
+
+def test_runs_that_aggregates_leave_out_are_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statistics, "N_RESAMPLES", 20)
+    message = "Aggregates take as many runs of a method as it has in each environment, the first ones by seed."
+    for method in ("abisim", "vanilla"):
+        for env_id in ("Nav2D-v0", "PointMaze-v0"):
+            for seed in range(2):
+                write_run(tmp_path, env_id, method, seed, STEPS, np.full((len(STEPS), 2), -40.0 - seed))
+    assert message not in compare([str(tmp_path)]).notes
+    for method in ("abisim", "vanilla"):
+        write_run(tmp_path, "Nav2D-v0", method, 2, STEPS, np.full((len(STEPS), 2), -30.0))
+    comparison = compare([str(tmp_path)])
+    assert message in comparison.notes and {row["n_runs"] for row in comparison.aggregates} == {2}
