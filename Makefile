@@ -20,7 +20,7 @@ $(VENV)/.installed: setup.cfg constraints.txt
 setup: $(VENV)/.installed  ## make .venv and install the package with its pinned dependencies
 
 demo: setup  ## collect, pretrain, train PPO, draw: the whole product in about ten minutes, into demo/
-	$(BIN)/python -m sb3_abisim.demo -o demo
+	$(BIN)/sb3-abisim demo -o demo
 
 test: setup  ## the tests that CI runs
 	$(BIN)/python -m pytest
@@ -53,7 +53,7 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_allocator
 
 figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about a quarter of an hour
-	$(BIN)/python -m sb3_abisim.analyze all --images docs/images --numbers benchmarks/results
+	$(BIN)/sb3-abisim analyze all --images docs/images --numbers benchmarks/results
 
 # The folders of committed runs whose curves stand in docs/results.md: of evaluations, and of training episodes.
 COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
@@ -64,7 +64,7 @@ NAV2D_VANILLA := vanilla, 10,000=benchmarks/results/comparison/nav2d_dqn/runs/Na
 comparisons: setup  ## draw every curve of docs/results.md anew from the committed runs; a minute
 	@draw() { \
 		name=$$1; shift; \
-		$(BIN)/python -m sb3_abisim.benchmark report benchmarks/results/comparison/$$name "$$@" -o build/comparisons/$$name && \
+		$(BIN)/sb3-abisim benchmark report benchmarks/results/comparison/$$name "$$@" -o build/comparisons/$$name && \
 		cp build/comparisons/$$name/curves.png docs/images/comparison-$$name.png; \
 	}; \
 	for name in $(COMPARISONS); do draw $$name || exit 1; done; \
@@ -73,7 +73,7 @@ comparisons: setup  ## draw every curve of docs/results.md anew from the committ
 	draw distractor_vanilla_longer benchmarks/results/comparison/distractor_finetuned_more --source training
 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
-	$(BIN)/python -m sb3_abisim.benchmark -o benchmark
+	$(BIN)/sb3-abisim benchmark -o benchmark
 
 # Budgets that show that the machinery works, and nothing about the methods. Of each thing the least that gives every part
 # of the report: two runs for intervals, one encoder for both (on the SSI encoder that it starts from), a baseline, clips.
@@ -83,7 +83,7 @@ SMOKE := --env Nav2D-v0 DistractorPointMaze-v0 --methods abisim vanilla --seeds 
 	--params dqn.learning_starts:100 ppo.n_envs:4 ppo.n_steps:64 ppo.batch_size:64 ppo.n_epochs:2
 
 benchmark-smoke: setup  ## the same graph and report with tiny budgets, in minutes, into benchmark-smoke/
-	$(BIN)/python -m sb3_abisim.benchmark -o benchmark-smoke $(SMOKE)
+	$(BIN)/sb3-abisim benchmark -o benchmark-smoke $(SMOKE)
 
 clean:  ## remove the environment and caches
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info

@@ -1,4 +1,4 @@
-"""Speed of PPO through pictures with and without ``sb3_abisim.allocator.keep_freed_memory``.
+"""Speed of PPO through pictures with and without ``sb3_abisim.common.malloc.keep_freed_memory``.
 
 An untrained network with the hyperparameters of ``hyperparams/`` (on Distractor PointMaze with shorter rollouts). The
 two settings run in turns, each turn in a process of its own, since the allocator's setting holds for a process. Steps
@@ -32,8 +32,8 @@ def turn(env_id: str, keep: bool) -> dict[str, float]:
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 
-    from sb3_abisim import VanillaExtractor
-    from sb3_abisim.allocator import keep_freed_memory
+    from sb3_abisim.common.malloc import keep_freed_memory
+    from sb3_abisim.rl.extractors import VanillaExtractor
 
     if keep and not keep_freed_memory():
         raise SystemExit("this C library is not glibc; there is nothing to compare")

@@ -41,11 +41,11 @@ def make_model(algo: str, kind: str) -> Any:
     from torch import nn
 
     from sb3_abisim import ActionBisimExtractor
-    from sb3_abisim.lockstep import LockstepVecEnv
-    from sb3_abisim.vec_env import VecEncodeObservations
+    from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
+    from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
     env_id, n_envs = ("DistractorPointMaze-v0", 16) if algo == "ppo" else ("Nav2D-v0", 1)
-    vec_env_class = LockstepVecEnv if n_envs > 1 else sb3.common.vec_env.DummyVecEnv
+    vec_env_class = BatchedVecEnv if n_envs > 1 else sb3.common.vec_env.DummyVecEnv
     env = vec_env_class([lambda: gym.make(env_id)] * n_envs)
     policy_kwargs: dict[str, Any] = {"net_arch": [256], "activation_fn": nn.ReLU}
     if kind == "encoded":

@@ -43,10 +43,10 @@ def main(argv: list[str] | None = None) -> None:
         with tempfile.TemporaryDirectory() as folder:
             data = f"{folder}/data"
             n = round(args.scale * n_transitions)
-            collected = peak_gigabytes(["sb3_abisim.collect", "--env", env_id, "-n", str(n), "-o", data])
+            collected = peak_gigabytes(["sb3_abisim", "collect", "--env", env_id, "-n", str(n), "-o", data])
             size = sum(path.stat().st_size for path in Path(data).iterdir()) / 1e9
             for objective in OBJECTIVES:
-                words = ["sb3_abisim.pretrain", "--objective", objective, "--env", env_id, "--data", data]
+                words = ["sb3_abisim", "pretrain", "--objective", objective, "--env", env_id, "--data", data]
                 words += ["-o", f"{folder}/{objective}.safetensors", "--device", "cpu", *UPDATES]
                 words += ["--base", f"{env_id}/ssi"] if objective == "abisim" else []
                 peak = peak_gigabytes(words)

@@ -3,7 +3,7 @@
 The straightforward loop is a ``torch.utils.data.Dataset`` that indexes one transition after the other and makes it
 float32, a ``DataLoader`` that shuffles and stacks them, pictures channels first, and Adam. Ours is measured with single
 transitions and, where both ends are embedded by the trained encoder, with ``run_length: 8``. The loops run in turns on
-one core, each in a process of its own, because ours sets the allocator (``sb3_abisim.allocator``). The speed of each is
+one core, each in a process of its own, because ours sets the allocator (``sb3_abisim.common.malloc``). The speed of each is
 that of its fastest turn, by processor time, which load on the machine disturbs less than the clock. ``make bench``.
 """
 
@@ -31,7 +31,7 @@ def straightforward(run: Any) -> Iterator[float]:
     import numpy as np
     import torch as th
 
-    from sb3_abisim.objectives import TensorBatch
+    from sb3_abisim.objectives.base import TensorBatch
 
     dataset = run.dataset
     shards = [np.load(path, mmap_mode="r") for path in sorted(dataset.path.glob("frames-*.npy"))]
@@ -64,16 +64,16 @@ def straightforward(run: Any) -> Iterator[float]:
 
 
 def ours(run: Any) -> Iterator[float]:
-    """The same by :mod:`sb3_abisim.pretrain_run`."""
+    """The same by :mod:`sb3_abisim.pretraining.trainer`."""
     for batch in run._batches():
         yield float(run._update(batch)["loss"])
 
 
 def make_run(objective: str, data: Path, base: str | None, folder: Path, run_length: int = 1) -> Any:
     """A pretraining run that has not begun."""
-    from sb3_abisim.dataset import TransitionDataset
-    from sb3_abisim.pretrain_config import load_config
-    from sb3_abisim.pretrain_run import PretrainRun
+    from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.pretraining.config import load_config
+    from sb3_abisim.pretraining.trainer import PretrainRun
 
     dataset = TransitionDataset(data, verify=False)
     config = load_config(
@@ -90,9 +90,9 @@ def serve_turns(pipe: Any, objective: str, data: Path, base: str | None, run_len
     """
     use_one_core()
     if run_length:
-        from sb3_abisim.allocator import keep_freed_memory
+        from sb3_abisim.common.malloc import keep_freed_memory
 
-        # As sb3_abisim.pretrain does.
+        # As sb3_abisim.pretraining.pretrain does.
         keep_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
         run = make_run(objective, data, base, Path(folder), max(run_length, 1))
@@ -186,8 +186,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--updates", type=int, default=6, help="updates per turn (default: %(default)s)")
     args = parser.parse_args(argv)
     use_one_core()
-    from sb3_abisim.allocator import keep_freed_memory
-    from sb3_abisim.collect import collect
+    from sb3_abisim.common.malloc import keep_freed_memory
+    from sb3_abisim.data.collect import collect
 
     keep_freed_memory()  # for the shares of our time
     peak = matmul_rate()

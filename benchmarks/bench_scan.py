@@ -26,7 +26,7 @@ LONGEST, LARGEST = 5.0, 1024.0  # s and MB of preprocessing
 
 _PREPROCESS = """
 import resource, sys, time
-from sb3_abisim.envs.scan_map import ScanMap
+from sb3_abisim.envs.scan_nav.map import ScanMap
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for cached in (False, True, True):
     start = time.process_time()

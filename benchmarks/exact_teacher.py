@@ -1,8 +1,8 @@
 """What a perfect learner of the metric would bring: ``python -m benchmarks.exact_teacher -o FILE [-c 0.9] [--seed 0]``.
 
 Action-bisimulation approaches its metric from recorded transitions. Here the same network, from the same base encoder,
-is fitted to distances that :mod:`sb3_abisim.tabular` has solved, between states of 8,000 layouts of Nav2D. How near it
-comes on other layouts (``python -m sb3_abisim.analyze exact FILE``) is what the network can hold, and what RL gains
+is fitted to distances that :mod:`sb3_abisim.analysis.exact_metric` has solved, between states of 8,000 layouts of Nav2D. How near it
+comes on other layouts (``sb3-abisim analyze exact FILE``) is what the network can hold, and what RL gains
 with it is what the metric itself is worth.
 """
 
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from sb3_abisim.analysis import nav2d_exact as nav
-from sb3_abisim.checkpoint import load_encoder, save_encoder
-from sb3_abisim.networks import Encoder
-from sb3_abisim.tabular import action_bisim_metric
+from sb3_abisim.analysis.exact_metric import action_bisim_metric
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
 
 ENV_ID = "Nav2D-v0"
 # Far from the held-out layouts of `analyze exact`.

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.tables import use_one_core
-from sb3_abisim.benchmark.evaluate import final_model
-from sb3_abisim.benchmark.runs import read_run
+from sb3_abisim.zoo.evaluate import final_model
+from sb3_abisim.zoo.runs import read_run
 
 PACKAGES = ("numpy", "torch", "stable_baselines3", "rl_zoo3", "gymnasium")
 # Points of a curve, each the mean over episodes that ended in its share of the training.

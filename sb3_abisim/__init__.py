@@ -1,7 +1,8 @@
 """Action-bisimulation and baseline encoders for Stable-Baselines3, pretrained without rewards.
 
-Importing the package registers its environments. The names that need torch are imported when they are first used, so
-that environments and data collection start quickly.
+Importing the package registers its environments. The other public names are imported when they are first used, so that
+environments and ``--help`` are there at once. The features extractors are those of the registered methods:
+``ActionBisimExtractor``, ``SSIExtractor`` and so on.
 """
 
 import importlib
@@ -9,52 +10,73 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_abisim import envs as _envs  # noqa: F401  (registers the environments)
 from sb3_abisim._version import __version__
+from sb3_abisim.registry import EnvTraits, register_method, register_network, register_reader, register_traits
 
 if TYPE_CHECKING:
-    from sb3_abisim.checkpoint import load_encoder, save_encoder
-    from sb3_abisim.dataset import TransitionDataset
-    from sb3_abisim.extractors import (
-        ACROExtractor,
-        ActionBisimExtractor,
-        BetaVAEExtractor,
-        CURLExtractor,
-        InfoNCEExtractor,
-        SSIExtractor,
-        VanillaExtractor,
-    )
-    from sb3_abisim.optimizers import EncoderLRAdam
+    from sb3_abisim.data.collect import collect
+    from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
+    from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
+    from sb3_abisim.networks.base import Encoder
+    from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
+    from sb3_abisim.objectives.base import Objective
+    from sb3_abisim.pretraining.pretrain import pretrain
+    from sb3_abisim.rl.callbacks import EncoderCallback
+    from sb3_abisim.rl.merge import merge_encoder
+    from sb3_abisim.rl.optimizers import EncoderLRAdam
+    from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
-_LAZY = {
-    "load_encoder": "checkpoint",
-    "save_encoder": "checkpoint",
-    "TransitionDataset": "dataset",
-    "ACROExtractor": "extractors",
-    "ActionBisimExtractor": "extractors",
-    "BetaVAEExtractor": "extractors",
-    "CURLExtractor": "extractors",
-    "InfoNCEExtractor": "extractors",
-    "SSIExtractor": "extractors",
-    "VanillaExtractor": "extractors",
-    "EncoderLRAdam": "optimizers",
+# Public name: the module that defines it.
+_PUBLIC = {
+    "BatchedVecEnv": "envs.sb3_vec_env",
+    "Encoder": "networks.base",
+    "EncoderCallback": "rl.callbacks",
+    "EncoderLRAdam": "rl.optimizers",
+    "Objective": "objectives.base",
+    "PointMazePixels": "envs.point_maze.pixel_wrapper",
+    "TransitionDataset": "data.dataset",
+    "VecEncodeObservations": "rl.vec_encode",
+    "collect": "data.collect",
+    "load_encoder": "networks.encoder_file",
+    "merge_encoder": "rl.merge",
+    "pretrain": "pretraining.pretrain",
+    "save_encoder": "networks.encoder_file",
 }
+_EXTRACTORS = "sb3_abisim.rl.extractors"
 
 __all__ = [
-    "ACROExtractor",
-    "ActionBisimExtractor",
-    "BetaVAEExtractor",
-    "CURLExtractor",
+    "BatchedVecEnv",
+    "Encoder",
+    "EncoderCallback",
     "EncoderLRAdam",
-    "InfoNCEExtractor",
-    "SSIExtractor",
+    "EnvTraits",
+    "Objective",
+    "PointMazePixels",
     "TransitionDataset",
-    "VanillaExtractor",
+    "VecEncodeObservations",
     "__version__",
+    "collect",
     "load_encoder",
+    "merge_encoder",
+    "pretrain",
+    "register_method",
+    "register_network",
+    "register_reader",
+    "register_traits",
     "save_encoder",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_LAZY[name]}"), name)
+    if name in _PUBLIC:
+        return getattr(importlib.import_module(f"{__name__}.{_PUBLIC[name]}"), name)
+    # That of a method, which may be somebody else's.
+    if name.endswith("Extractor"):
+        return getattr(importlib.import_module(_EXTRACTORS), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    from sb3_abisim.registry import methods
+
+    return sorted({*globals(), *__all__, *(method.extractor for method in methods().values())})

@@ -1,4 +1,4 @@
-"""The whole product in about ten minutes on two cores: ``python -m sb3_abisim.demo -o demo``.
+"""The whole product in about ten minutes on two cores: ``sb3-abisim demo -o demo``.
 
 Runs the commands that a user would type, prints each before it starts, and ends with a learning curve, a GIF of the
 trained agent and the folder where everything lies. The budget is far below the paper's; it shows the way, not a result.
@@ -10,9 +10,11 @@ import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_abisim.film import film
+from sb3_abisim.common.cli import PROGRAM, make_parser, run
+from sb3_abisim.zoo.record import record
 
 ENV_ID = "DistractorPointMaze-v0"
 
@@ -26,14 +28,14 @@ def commands(folder: Path, n_transitions: int, n_updates: int, n_timesteps: int)
     :param n_timesteps: steps of PPO
     """
     data, ssi, abisim = folder / "data", folder / "ssi.safetensors", folder / "abisim.safetensors"
-    pretrain = ["sb3_abisim.pretrain", "--env", ENV_ID, "--data", str(data), "--verbose", "0"]
+    pretrain = ["sb3_abisim", "pretrain", "--env", ENV_ID, "--data", str(data), "--verbose", "0"]
     updates = ["-params", f"n_updates:{n_updates}", f"checkpoint_interval:{n_updates}"]
     return [
-        ["sb3_abisim.collect", "--env", ENV_ID, "-n", str(n_transitions), "-o", str(data)],
+        ["sb3_abisim", "collect", "--env", ENV_ID, "-n", str(n_transitions), "-o", str(data)],
         [*pretrain, "--objective", "ssi", "-o", str(ssi), *updates],
         [*pretrain, "--objective", "abisim", "--base", str(ssi), "-o", str(abisim), *updates],
         # The paper's rollouts of 65,536 steps and learning rate of 2.5e-5 are made for 7 million steps.
-        ["sb3_abisim.zoo", "train", "--algo", "ppo", "--env", ENV_ID, "--conf-file", f"abisim={abisim},frozen",
+        ["sb3_abisim", "train", "--algo", "ppo", "--env", ENV_ID, "--conf-file", f"abisim={abisim},frozen",
          "-n", str(n_timesteps), "-f", str(folder / "logs"), "--seed", "0", "--verbose", "0", "-P",
          "--eval-freq", "-1", "-params", "n_envs:16", "n_steps:128", "batch_size:256", "n_epochs:4",
          "learning_rate:3e-4"],
@@ -75,35 +77,34 @@ def draw_learning_curve(run: Path, path: Path, n_smooth: int = 100) -> None:
     plt.close(figure)
 
 
-def main(argv: list[str] | None = None) -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """The command; see ``--help``.
 
     :param argv: arguments, None for those of the process
     """
-    parser = argparse.ArgumentParser("python -m sb3_abisim.demo", description=__doc__.split("\n\n")[0])
+    parser = make_parser("demo", "The whole way in about ten minutes on two cores.", "demo -o demo")
     parser.add_argument("-o", "--output", default="demo", metavar="DIR", help="folder for everything (default: demo)")
     parser.add_argument("--n-transitions", type=int, default=50_000)
     parser.add_argument("--n-updates", type=int, default=2_000)
     parser.add_argument("--n-timesteps", type=int, default=250_000)
-    args = parser.parse_args(argv)
+    run(parser, argv, _command)
+
+
+def _command(args: argparse.Namespace) -> None:
     # Now, not after ten minutes.
     missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
     if missing:
-        parser.error(f"{' and '.join(missing)} not installed; run: pip install 'sb3_abisim[plots]'")
+        raise ValueError(f"{' and '.join(missing)} not installed; run: pip install 'sb3_abisim[plots]'")
     folder, start = Path(args.output), time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     for words in commands(folder, args.n_transitions, args.n_updates, args.n_timesteps):
-        print(f"\n$ python -m {shlex.join(words)}", flush=True)
+        print(f"\n$ {shlex.join([PROGRAM, *words[1:]])}", flush=True)
         subprocess.run([sys.executable, "-m", *words], check=True)
-    run = newest_run(folder)
-    draw_learning_curve(run, folder / "learning_curve.png")
-    success = film(run, folder / "agent.gif")
+    zoo_run = newest_run(folder)
+    draw_learning_curve(zoo_run, folder / "learning_curve.png")
+    success = record(zoo_run, folder / "agent.gif")
     minutes = (time.monotonic() - start) / 60
-    print(f"\nDone in {minutes:.1f} minutes; the agent reached the goal in {success:.0%} of the filmed episodes.")
+    print(f"\nDone in {minutes:.1f} minutes; the agent reached the goal in {success:.0%} of the recorded episodes.")
     print(f"  learning curve    {folder / 'learning_curve.png'}")
     print(f"  the agent         {folder / 'agent.gif'}")
     print(f"  everything        {folder.resolve()}")
-
-
-if __name__ == "__main__":
-    main()

@@ -6,8 +6,8 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_abisim.checkpoint import EncoderFile
-from sb3_abisim.networks import Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.encoder_file import EncoderFile
 
 
 class Masked(nn.Module):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from sb3_abisim.zoo import EXTRACTORS
+from sb3_abisim.zoo.methods import EXTRACTORS
 
 
 def write_run(
@@ -30,7 +30,7 @@ def write_run(
     name, _, how = method.partition(",")
     kwargs = {"encoder": f"{name}-{seed}.safetensors", **({"freeze": True} if how == "freeze" else {})}
     shown = f", features_extractor_kwargs={kwargs!r}" if name != "vanilla" else ""
-    text = f"dict(features_extractor_class=get_class_by_name('sb3_abisim.extractors.{EXTRACTORS[name]}'){shown})"
+    text = f"dict(features_extractor_class=get_class_by_name('sb3_abisim.rl.extractors.{EXTRACTORS[name]}'){shown})"
     args = {
         "algo": algo, "env": env_id, "seed": seed, "n_timesteps": n_timesteps or steps[-1], "env_kwargs": None,
         "eval_env_kwargs": None, "eval_freq": steps[0], "eval_episodes": returns.shape[1], "conf_file": method,
@@ -39,10 +39,10 @@ def write_run(
     (run / env_id / "args.yml").write_text(yaml.dump(OrderedDict(sorted(args.items()))))
     config = OrderedDict([("n_timesteps", 7_000_000), ("policy", "CnnPolicy"), ("policy_kwargs", text)])
     if how == "frozen":
-        wrapper = {"sb3_abisim.vec_env.VecEncodeObservations": {"encoder": kwargs["encoder"], "objective": name}}
+        wrapper = {"sb3_abisim.rl.vec_encode.VecEncodeObservations": {"encoder": kwargs["encoder"], "objective": name}}
         config |= {"policy": "MlpPolicy", "policy_kwargs": "dict(net_arch=[256])", "vec_env_wrapper": [wrapper]}
     (run / env_id / "config.yml").write_text(yaml.dump(config))
-    (run / env_id / "command.txt").write_text(f"python -m sb3_abisim.zoo train --seed {seed}")
+    (run / env_id / "command.txt").write_text(f"sb3-abisim train --seed {seed}")
     np.savez(run / "evaluations.npz", timesteps=steps, results=returns, ep_lengths=-returns, successes=returns > -100)
     if final:
         np.savez(run / "final_evaluations.npz", **{f"{key}/results": value for key, value in final.items()})

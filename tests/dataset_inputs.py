@@ -5,7 +5,7 @@ from pathlib import Path
 import index_env  # noqa: F401  (registers the environment)
 import pytest
 
-from sb3_abisim import collect as collect_module
+from sb3_abisim.data import collect as collect_module
 
 N = 420
 

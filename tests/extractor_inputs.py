@@ -11,9 +11,9 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_abisim.checkpoint import save_encoder
-from sb3_abisim.extractors import ActionBisimExtractor
-from sb3_abisim.networks import Encoder, make_encoder
+from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.networks.encoder_file import save_encoder
+from sb3_abisim.rl.extractors import ActionBisimExtractor
 
 SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
 FRAMES = np.random.default_rng(0).integers(0, 256, (6, 3, 15, 15), np.uint8)

@@ -17,7 +17,7 @@ import index_env  # noqa: F401  registers ids
 import tqdm  # noqa: F401  here once instead of in every child
 from test_collect import tree
 
-from sb3_abisim import collect as collect_module
+from sb3_abisim.data import collect as collect_module
 
 CALLS = ("fsync", "replace", "unlink", "posix_fallocate", "mkdir", "ftruncate")
 

@@ -5,7 +5,8 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.heads import MLP
 from sb3_abisim.objectives.base import Objective, TensorBatch
 
 DISCRETE = gym.spaces.Discrete(3)

@@ -1,8 +1,8 @@
 """What the tests of pretraining share: a small dataset, and runs of seconds."""
 
-from sb3_abisim.collect import collect
-from sb3_abisim.pretrain import pretrain
-from sb3_abisim.pretrain_config import load_config
+from sb3_abisim.data.collect import collect
+from sb3_abisim.pretraining.config import load_config
+from sb3_abisim.pretraining.pretrain import pretrain
 
 SETTINGS = {"n_updates": 30, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5}
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sb3_abisim.envs.scan_map import ScanMap
+from sb3_abisim.envs.scan_nav.map import ScanMap
 
 # Inner size of the house, z up: x from 0 to 5, y from 0 to 4. A wall 10 cm thick at x = 2.5 with a door in the north.
 WALLS = [(-0.2, -0.2, 0, 4.2), (5, -0.2, 5.2, 4.2), (0, -0.2, 5, 0), (0, 4, 5, 4.2), (2.45, 0, 2.55, 2.6)]

@@ -8,7 +8,8 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.heads import MLP
 from sb3_abisim.objectives.action_bisim import (
     ActionBisimulation,
     action_bisim_target,

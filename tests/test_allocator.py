@@ -6,12 +6,12 @@ import sys
 
 import pytest
 
-from sb3_abisim.allocator import keep_freed_memory
+from sb3_abisim.common.malloc import keep_freed_memory
 
 COUNT_FAULTS = """
 import resource
 import torch as th
-from sb3_abisim.allocator import keep_freed_memory
+from sb3_abisim.common.malloc import keep_freed_memory
 if {keep}:
     assert keep_freed_memory()
 def fill():

@@ -9,11 +9,18 @@ from typing import BinaryIO
 
 import pytest
 
-from sb3_abisim.atomic import LOCK_NAME, FolderLockedError, file_digest, folder_lock, remove_temporaries, write_atomic
+from sb3_abisim.common.files import (
+    LOCK_NAME,
+    FolderLockedError,
+    file_digest,
+    folder_lock,
+    remove_temporaries,
+    write_atomic,
+)
 
 HOLD_LOCK = """
 import sys, time
-from sb3_abisim.atomic import folder_lock
+from sb3_abisim.common.files import folder_lock
 with folder_lock(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)

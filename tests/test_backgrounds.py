@@ -7,18 +7,11 @@ import json
 import numpy as np
 import pytest
 
-from sb3_abisim.envs import backgrounds as module
-from sb3_abisim.envs.backgrounds import (
-    MEDIA_FOLDER,
-    BackgroundPlayer,
-    Backgrounds,
-    Clip,
-    composite,
-    digest_of,
-    load_backgrounds,
-    render_pan,
-    split_groups,
-)
+from sb3_abisim.envs.backgrounds import backgrounds as module
+from sb3_abisim.envs.backgrounds.clips import Backgrounds, Clip, digest_of, split_groups
+from sb3_abisim.envs.backgrounds.load import load_backgrounds
+from sb3_abisim.envs.backgrounds.photo_pan import MEDIA_FOLDER, render_pan
+from sb3_abisim.envs.backgrounds.player import BackgroundPlayer, composite
 
 MANIFEST = json.loads((MEDIA_FOLDER / "photo_pan.json").read_text(encoding="utf-8"))
 

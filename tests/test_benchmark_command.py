@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_abisim.atomic import file_digest
-from sb3_abisim.benchmark.__main__ import main
-from sb3_abisim.benchmark.graph import Plan, build
-from sb3_abisim.benchmark.sources import source_digest
+from sb3_abisim.benchmark.command import main
+from sb3_abisim.benchmark.jobs.source_hash import source_digest
+from sb3_abisim.benchmark.plan import Plan, build
+from sb3_abisim.common.files import file_digest
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = [
@@ -32,7 +32,7 @@ def test_dry_run_lists_the_cells_and_does_nothing(tmp_path: Path, capsys: pytest
     out = capsys.readouterr().out
     assert [line.split()[1].split("-")[0] for line in out.splitlines()[::2]] == ["data", "encoder", "run", "final"]
     assert all(line.startswith("missing") for line in out.splitlines()[::2])
-    assert "python -m sb3_abisim.pretrain --objective ssi --env Nav2D-v0" in out
+    assert "sb3-abisim pretrain --objective ssi --env Nav2D-v0" in out
     assert not (tmp_path / "new").exists()
 
 
@@ -105,7 +105,7 @@ def test_the_whole_graph_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 @pytest.mark.slow
 def test_a_kill_costs_the_cell_in_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = [sys.executable, "-m", "sb3_abisim.benchmark", "-o", str(tmp_path), *SMALL]
+    command = [sys.executable, "-m", "sb3_abisim", "benchmark", "-o", str(tmp_path), *SMALL]
     driver = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)})
     deadline = time.monotonic() + 300
     while not list(tmp_path.glob("work/run-*/dqn/*/evaluations.npz")):
@@ -118,7 +118,7 @@ def test_a_kill_costs_the_cell_in_flight(tmp_path: Path, capsys: pytest.CaptureF
     main(["-o", str(tmp_path), *SMALL])
     assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in kept.items()), "what was done stays done"
     (log,) = (tmp_path / "logs").glob("run-*.log")
-    assert log.read_text().count("$ python -m sb3_abisim.zoo train") == 2
+    assert log.read_text().count("$ sb3-abisim train") == 2
     assert "4 of 4 cells done, 2 of them before; 0 failed" in capsys.readouterr().err
     (run,) = (tmp_path / "runs").glob("Nav2D-v0/ssi-*/dqn/Nav2D-v0_*")
     assert np.load(run / "evaluations.npz")["timesteps"].tolist() == list(range(200, 2001, 200))

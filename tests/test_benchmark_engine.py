@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_abisim.atomic import FolderLockedError, folder_lock, write_atomic
-from sb3_abisim.benchmark.cell import CellError, is_done
-from sb3_abisim.benchmark.engine import LocalEngine, done_share, make_engine, run_cells
-from sb3_abisim.benchmark.graph import Cell
-from sb3_abisim.benchmark.sources import source_digest
+from sb3_abisim.benchmark.jobs.job import CellError, is_done
+from sb3_abisim.benchmark.jobs.local import LocalEngine, done_share, make_engine, run_cells
+from sb3_abisim.benchmark.jobs.source_hash import source_digest
+from sb3_abisim.benchmark.plan import Cell
+from sb3_abisim.common.files import FolderLockedError, folder_lock, write_atomic
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -35,7 +35,7 @@ class FakeEngine:
         self.failing, self.ran, self.closed = failing, [], False
 
     def submit(self, root: Path, cell: Cell) -> "Future[None]":
-        from sb3_abisim.atomic import file_digest
+        from sb3_abisim.common.files import file_digest
 
         self.ran.append(cell.title)
         future: Future[None] = Future()
@@ -146,7 +146,7 @@ def test_the_share_that_is_done(tmp_path: Path) -> None:
 
 DRIVER = """
 import pathlib, sys
-from sb3_abisim.benchmark.cell import launch
+from sb3_abisim.benchmark.jobs.job import launch
 cell = {"name": "encoder-0", "kind": "encoder", "title": "t", "settings": {}, "inputs": [], "proof": "", "units": 1,
         "output": "never", "command": ["http.server", "0", "--bind", "127.0.0.1"]}
 launch(pathlib.Path(sys.argv[1]), cell, 1)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from benchmark_inputs import write_run
 
-from sb3_abisim.benchmark import statistics
-from sb3_abisim.benchmark.__main__ import main
+from sb3_abisim.benchmark.command import main
 from sb3_abisim.benchmark.export import export, without_folders
-from sb3_abisim.benchmark.report import report
-from sb3_abisim.benchmark.runs import find_runs
+from sb3_abisim.benchmark.report import statistics
+from sb3_abisim.benchmark.report.page import report
+from sb3_abisim.zoo.runs import find_runs
 
 STEPS = [100, 200, 300, 400]
 
@@ -40,9 +40,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
             args = run / "DistractorPointMaze-v0" / "args.yml"
             args.write_text(args.read_text().replace(f"- {method}\n", f"- {method}={root}/encoders/e.safetensors\n"))
             command = run / "DistractorPointMaze-v0" / "command.txt"
-            command.write_text(
-                f"python -m sb3_abisim.zoo train --conf-file abisim=/home/me/e.safetensors --seed {seed}"
-            )
+            command.write_text(f"sb3-abisim train --conf-file abisim=/home/me/e.safetensors --seed {seed}")
             (run / "DistractorPointMaze-v0.zip").write_bytes(bytes(10_000))
             (run / "best_model.zip").write_bytes(bytes(10_000))
             episodes = [

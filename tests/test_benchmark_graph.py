@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from zoo_inputs import write_encoder
 
-from sb3_abisim.benchmark.graph import Cell, Plan, build, run_labels
-from sb3_abisim.zoo import DISTRACTOR_IDS
+from sb3_abisim.benchmark.plan import Cell, Plan, build, run_labels
+from sb3_abisim.zoo.methods import DISTRACTOR_IDS
 
 PLAN = Plan(methods=("abisim", "ssi", "vanilla"), env_ids=("Nav2D-v0", "DistractorPointMaze-v0"), seeds=(0, 1))
 

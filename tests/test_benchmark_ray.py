@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_abisim.benchmark.engine import run_cells
-from sb3_abisim.benchmark.graph import Cell, Plan, build
-from sb3_abisim.benchmark.ray_engine import RayEngine, _execute
+from sb3_abisim.benchmark.jobs.local import run_cells
+from sb3_abisim.benchmark.jobs.ray import RayEngine, _execute
+from sb3_abisim.benchmark.plan import Cell, Plan, build
 from sb3_abisim.benchmark.sweep import sweep
 
 # Ray's own programs leave sockets and files open.
@@ -25,7 +25,7 @@ PLAN = Plan(
 
 def test_a_node_of_another_version_or_without_the_folder_is_refused(tmp_path: Path) -> None:
     from sb3_abisim._version import __version__
-    from sb3_abisim.benchmark.cell import CellError
+    from sb3_abisim.benchmark.jobs.job import CellError
 
     cell = build(PLAN)[0].to_json()
     with pytest.raises(CellError, match=r"has sb3_abisim .* runs with 0\.0\.1"):

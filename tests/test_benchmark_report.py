@@ -12,12 +12,12 @@ import pytest
 from benchmark_inputs import write_run
 from PIL import Image
 
-from sb3_abisim.benchmark import statistics
-from sb3_abisim.benchmark.__main__ import main
-from sb3_abisim.benchmark.comparison import compare, split_label
-from sb3_abisim.benchmark.figures import MINUS, assign_colours
-from sb3_abisim.benchmark.report import _verdict, report
-from sb3_abisim.benchmark.runs import find_runs, read_run
+from sb3_abisim.benchmark.command import main
+from sb3_abisim.benchmark.report import statistics
+from sb3_abisim.benchmark.report.figures import MINUS, assign_colours
+from sb3_abisim.benchmark.report.page import _verdict, report
+from sb3_abisim.benchmark.report.tables import compare, split_label
+from sb3_abisim.zoo.runs import find_runs, read_run
 
 STEPS = list(range(1000, 11_000, 1000))
 # The step at which a method jumps from -100 to -20, per seed; above the last step it never does.
@@ -156,7 +156,7 @@ def test_page_needs_no_other_file_and_says_how_it_was_evaluated(made: Path) -> N
     text = re.sub(r"\s+", " ", " ".join(page.words))
     assert len(page.sources) == 6 and all(source.startswith("data:image/png;base64,") for source in page.sources)
     assert "Evaluation is deterministic" in text and f"mean of {N_EPISODES} episodes" in text
-    assert "python -m sb3_abisim.zoo train --seed 1" in text
+    assert "sb3-abisim train --seed 1" in text
     assert "0.61 times the steps of ssi" in text
     assert f"To where vanilla ends, {MINUS}73.33, abisim needs ≤ 0.37 times the steps of vanilla: fewer" in text
     assert f"No run of any method reached {MINUS}12.8 in PointMaze-v0." in text and "none arrived" not in text

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_abisim.benchmark.sources import PACKAGE, source_digest
+from sb3_abisim.benchmark.jobs.source_hash import PACKAGE, source_digest
 
 KINDS = ("data", "encoder", "run", "final")
 

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sb3_abisim.benchmark import statistics
+from sb3_abisim.benchmark.report import statistics
 
 RNG = np.random.default_rng(5)
 N_RESAMPLES = 200  # rliable is slow

@@ -14,11 +14,11 @@ import pytest
 from benchmark_inputs import write_run
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-from sb3_abisim.atomic import file_digest
-from sb3_abisim.benchmark import __main__ as command
-from sb3_abisim.benchmark.cell import CellError
-from sb3_abisim.benchmark.graph import Cell, Plan, build
+from sb3_abisim.benchmark import command as command
+from sb3_abisim.benchmark.jobs.job import CellError
+from sb3_abisim.benchmark.plan import Cell, Plan, build
 from sb3_abisim.benchmark.sweep import best_of, parse_space, sweep
+from sb3_abisim.common.files import file_digest
 
 STEPS = [100, 200, 300, 400]
 PLAN = Plan(

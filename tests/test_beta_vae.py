@@ -6,8 +6,8 @@ import pytest
 import torch as th
 from objective_inputs import DISCRETE, LineEncoder, fit, make_batch
 
-from sb3_abisim.decoder import Decoder
-from sb3_abisim.networks import PointMazeEncoder
+from sb3_abisim.networks.decoder import Decoder
+from sb3_abisim.networks.paper import PointMazeEncoder
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.objectives.beta_vae import BetaVAE, beta_vae_loss
 

@@ -14,11 +14,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from sb3_abisim.callbacks import EncoderCallback
-from sb3_abisim.checkpoint import save_encoder
-from sb3_abisim.extractors import ActionBisimExtractor, VanillaExtractor, find_extractors
-from sb3_abisim.networks import make_encoder
-from sb3_abisim.vec_env import VecEncodeObservations
+from sb3_abisim.networks.base import make_encoder
+from sb3_abisim.networks.encoder_file import save_encoder
+from sb3_abisim.rl.callbacks import EncoderCallback
+from sb3_abisim.rl.checks import find_extractors
+from sb3_abisim.rl.extractors import ActionBisimExtractor, VanillaExtractor
+from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
 
 class Grid(gym.Env):
@@ -167,7 +168,7 @@ def test_stacked_embeddings_are_trained_on(encoder: tuple[str, str], capsys: pyt
 
 def test_training_keeps_freed_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[bool] = []
-    monkeypatch.setattr("sb3_abisim.callbacks.keep_freed_memory", lambda: calls.append(True))
+    monkeypatch.setattr("sb3_abisim.rl.callbacks.keep_freed_memory", lambda: calls.append(True))
     policy_kwargs = {"features_extractor_class": VanillaExtractor}
     model = PPO("CnnPolicy", Grid(), n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=policy_kwargs, device="cpu")
     model.learn(8, callback=EncoderCallback())

@@ -14,9 +14,9 @@ import safetensors.torch
 import torch as th
 from gymnasium import spaces
 
-from sb3_abisim import checkpoint
-from sb3_abisim.checkpoint import EncoderFileError, load_encoder, save_encoder
-from sb3_abisim.networks import Encoder, make_encoder
+from sb3_abisim.networks import encoder_file as checkpoint
+from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
 
 SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
 ACTIONS = spaces.Box(np.array([-1, -2], np.float32), np.array([3, 4], np.float32))
@@ -140,7 +140,7 @@ def test_no_flipped_bit_loads(path: Path) -> None:
         path.write_bytes(bad)
         with pytest.raises(EncoderFileError) as raised:
             load_encoder(path)
-        assert str(path) in str(raised.value) and "sb3_abisim.pretrain" in str(raised.value)
+        assert str(path) in str(raised.value) and "sb3_abisim.pretraining.pretrain" in str(raised.value)
     path.write_bytes(good)
     load_encoder(path)
 

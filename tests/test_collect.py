@@ -12,17 +12,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_abisim import collect as collect_module
-from sb3_abisim import dataset_writer
-from sb3_abisim.atomic import folder_lock
-from sb3_abisim.collect import collect, collect_shard, main, make_vector_env
-from sb3_abisim.dataset import TransitionDataset
-from sb3_abisim.dataset_format import CONFIG_NAME, CUT, META_NAME, TERMINATED, TRUNCATED, DatasetError
+from sb3_abisim.common.files import folder_lock
+from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data import writer as dataset_writer
+from sb3_abisim.data.collect import collect, collect_shard, main, make_vector_env
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.format import CONFIG_NAME, CUT, META_NAME, TERMINATED, TRUNCATED, DatasetError
 
 N_ENVS = 4
 # 12 steps of 4 copies: two time limits.
 PER_SHARD = 48
-COMMAND = [sys.executable, "-m", "sb3_abisim.collect", "--gym-packages", "index_env", "--n-envs", str(N_ENVS)]
+COMMAND = [sys.executable, "-m", "sb3_abisim", "collect", "--gym-packages", "index_env", "--n-envs", str(N_ENVS)]
 KILL_EVERYWHERE = str(Path(__file__).parent / "kill_everywhere.py")
 CHILD_ENV = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
 
@@ -368,5 +368,5 @@ def test_shards_too_large_for_memory_are_refused(tmp_path: Path, monkeypatch: py
 
 
 def test_torch_is_not_imported() -> None:
-    code = "import sys, sb3_abisim.collect, sb3_abisim.dataset; sys.exit('torch' in sys.modules)"
+    code = "import sys, sb3_abisim.data.collect, sb3_abisim.data.dataset; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], env=CHILD_ENV).returncode == 0

@@ -7,9 +7,9 @@ import index_env
 import numpy as np
 import pytest
 
-from sb3_abisim import collect as collect_module
-from sb3_abisim.collect import collect, main
-from sb3_abisim.dataset import TransitionDataset
+from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data.collect import collect, main
+from sb3_abisim.data.dataset import TransitionDataset
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import pytest
 import torch as th
 from objective_inputs import DISCRETE, LineEncoder, fit, make_batch
 
-from sb3_abisim.augmentations import random_crop, random_noise, random_shift
+from sb3_abisim.networks.augmentations import random_crop, random_noise, random_shift
 from sb3_abisim.objectives.curl import CURL, curl_loss
 
 

@@ -11,18 +11,11 @@ import numpy as np
 import pytest
 from dataset_inputs import N, collect_index
 
-import sb3_abisim.dataset as dataset_module
-from sb3_abisim.dataset import TransitionDataset
-from sb3_abisim.dataset_format import (
-    CUT,
-    INSIDE,
-    TERMINATED,
-    TRUNCATED,
-    is_shard_file,
-    space_from_json,
-    space_to_json,
-)
-from sb3_abisim.dataset_writer import Segment, open_writer
+import sb3_abisim.data.dataset as dataset_module
+from sb3_abisim.common.spaces import space_from_json, space_to_json
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED, is_shard_file
+from sb3_abisim.data.writer import Segment, open_writer
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from dataset_inputs import collect_index
 
-import sb3_abisim.dataset as dataset_module
-from sb3_abisim.dataset import TransitionDataset
-from sb3_abisim.dataset_format import (
+import sb3_abisim.data.dataset as dataset_module
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.format import (
     META_NAME,
     DatasetError,
     make_meta,
@@ -56,7 +56,7 @@ def test_truncated_and_missing_files_are_named(copy: Path) -> None:
     content = path.read_bytes()
     path.write_bytes(content[:-1])
     with pytest.raises(
-        DatasetError, match=rf"actions-00001.npy has {len(content) - 1} bytes.*sb3_abisim.collect --env"
+        DatasetError, match=rf"actions-00001.npy has {len(content) - 1} bytes.*sb3_abisim.data.collect --env"
     ):
         TransitionDataset(copy, verify=False)
     path.unlink()

@@ -10,12 +10,12 @@ from scan_inputs import empty_room
 from test_collect import tree
 from test_dataset_damage import rewrite_meta
 
-from sb3_abisim import atomic
-from sb3_abisim import collect as collect_module
-from sb3_abisim.collect import collect, collect_shard, make_vector_env
-from sb3_abisim.dataset import TransitionDataset
-from sb3_abisim.dataset_format import META_NAME, DatasetError
-from sb3_abisim.envs.scan_nav import ScanNavEnv, ScanNavVectorEnv
+from sb3_abisim.common import files as atomic
+from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data.collect import collect, collect_shard, make_vector_env
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.format import META_NAME, DatasetError
+from sb3_abisim.envs.scan_nav.env import ScanNavEnv, ScanNavVectorEnv
 
 N = 500
 SMALL = {"stop": "auto", "image_size": 32, "goals_per_scene": 3, "max_episode_steps": 40}

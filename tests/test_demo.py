@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from sb3_abisim.demo import main, newest_run
-from sb3_abisim.film import PIXELS
+from sb3_abisim.zoo.record import PIXELS
 
 
 def test_demo_leaves_a_curve_a_gif_and_a_run(tmp_path, capfd):

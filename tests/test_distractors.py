@@ -6,10 +6,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import sb3_abisim  # noqa: F401
-from sb3_abisim.envs.backgrounds import load_backgrounds
-from sb3_abisim.envs.distractors import DistractorPointMazeEnv, DistractorPointMazeVectorEnv
-from sb3_abisim.envs.point_maze import PointMazeVectorEnv
-from sb3_abisim.envs.point_maze_layout import to_pixels
+from sb3_abisim.envs.backgrounds.load import load_backgrounds
+from sb3_abisim.envs.point_maze.distractors import DistractorPointMazeEnv, DistractorPointMazeVectorEnv
+from sb3_abisim.envs.point_maze.env import PointMazeVectorEnv
+from sb3_abisim.envs.point_maze.layout import to_pixels
 
 PUSHES = np.random.default_rng(9).integers(0, 4, (40, 3))
 

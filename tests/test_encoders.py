@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.pretrain import OBJECTIVE_NAMES
-from sb3_abisim.pretrain_config import load_config
-from sb3_abisim.resources import resource_path
+from sb3_abisim.common.paths import resource_path
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.pretraining.config import load_config
+from sb3_abisim.pretraining.pretrain import OBJECTIVE_NAMES
 
 FILES = sorted(resource_path("encoders").glob("*/*.safetensors"))
 

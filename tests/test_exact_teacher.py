@@ -6,7 +6,7 @@ import torch as th
 
 from benchmarks import exact_teacher
 from sb3_abisim.analysis import nav2d_exact as nav
-from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
 
 C = 0.9
 

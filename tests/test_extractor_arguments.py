@@ -12,10 +12,11 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_abisim
-from sb3_abisim import networks, zoo
-from sb3_abisim.extractors import ActionBisimExtractor, PretrainedExtractor, VanillaExtractor
+from sb3_abisim.networks import base as networks
 from sb3_abisim.objectives import OBJECTIVES
-from sb3_abisim.pretrain import OBJECTIVE_NAMES
+from sb3_abisim.pretraining.pretrain import OBJECTIVE_NAMES
+from sb3_abisim.rl.extractors import ActionBisimExtractor, PretrainedExtractor, VanillaExtractor
+from sb3_abisim.zoo import manager as zoo
 
 
 @pytest.fixture(autouse=True)

@@ -16,18 +16,17 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from sb3_abisim import networks
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.extractors import (
+from sb3_abisim.networks import base as networks
+from sb3_abisim.networks.base import make_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.rl.checks import find_extractors, require_weights
+from sb3_abisim.rl.extractors import (
     ActionBisimExtractor,
     EncoderExtractor,
     PretrainedExtractor,
     SSIExtractor,
     VanillaExtractor,
-    find_extractors,
-    require_weights,
 )
-from sb3_abisim.networks import make_encoder
 
 
 @pytest.fixture(autouse=True)

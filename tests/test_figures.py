@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from zoo_inputs import write_encoder
 
-from sb3_abisim import analyze
+from sb3_abisim.analysis import command as analyze
 from sb3_abisim.analysis import nav2d_exact, pixels, probes, sweep
 from sb3_abisim.analysis.figures import FIGURES, default_encoders
 from sb3_abisim.analysis.sweep import sweep_encoders
-from sb3_abisim.checkpoint import load_encoder, resolve_encoder
-from sb3_abisim.collect import collect
-from sb3_abisim.pretrain_config import load_config
-from sb3_abisim.resources import resource_path
+from sb3_abisim.common.paths import resource_path
+from sb3_abisim.data.collect import collect
+from sb3_abisim.networks.encoder_file import load_encoder, resolve_encoder
+from sb3_abisim.pretraining.config import load_config
 
 PNG = b"\x89PNG\r\n"
 SIZES = {"perturbation": 1, "near-far": 6, "structures": 1, "pixels": 12, "neighbours": 6, "probes": 20, "leak": 20}

@@ -12,13 +12,13 @@ from PIL import Image
 from stable_baselines3 import PPO
 from zoo_inputs import SMALL
 
-from sb3_abisim import film as film_module
-from sb3_abisim import zoo
-from sb3_abisim.benchmark.__main__ import main as benchmark
-from sb3_abisim.benchmark.evaluate import final_model
+from sb3_abisim.benchmark.command import main as benchmark
 from sb3_abisim.benchmark.export import export
-from sb3_abisim.benchmark.runs import find_runs, read_run
-from sb3_abisim.film import MILLISECONDS, N_LAST, film, main
+from sb3_abisim.zoo import manager as zoo
+from sb3_abisim.zoo import record as film_module
+from sb3_abisim.zoo.evaluate import final_model
+from sb3_abisim.zoo.record import MILLISECONDS, N_LAST, film, main
+from sb3_abisim.zoo.runs import find_runs, read_run
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message)
         ({"normalize": "{'norm_obs': False}"}, None),
         ({"normalize": {"norm_obs": False}}, None),
         ({"normalize": "False"}, None),
-        ({"vec_env_wrapper": [{"sb3_abisim.vec_env.VecEncodeObservations": {"encoder": "e"}}]}, None),
+        ({"vec_env_wrapper": [{"sb3_abisim.rl.vec_encode.VecEncodeObservations": {"encoder": "e"}}]}, None),
     ],
 )
 def test_wrappers_that_would_be_missing_are_named(run_folder, settings, named):
@@ -150,7 +150,7 @@ def test_an_environment_in_a_namespace(tmp_path, monkeypatch, capsys):
     gym.register("toy/Grid-v0", entry_point=gym.spec("Nav2D-v0").entry_point, max_episode_steps=9)
     try:
         settings = "policy: CnnPolicy, n_timesteps: 64, n_envs: 2, n_steps: 32, batch_size: 32"
-        extractor = "dict(features_extractor_class=get_class_by_name('sb3_abisim.extractors.VanillaExtractor'))"
+        extractor = "dict(features_extractor_class=get_class_by_name('sb3_abisim.rl.extractors.VanillaExtractor'))"
         (tmp_path / "own.yml").write_text(f'toy/Grid-v0: {{{settings}, policy_kwargs: "{extractor}"}}')
         words = ["--algo", "ppo", "--env", "toy/Grid-v0", "-f", str(tmp_path / "logs"), "--eval-freq", "-1"]
         monkeypatch.setattr("sys.argv", [])

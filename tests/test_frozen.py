@@ -10,11 +10,12 @@ import torch as th
 from extractor_inputs import ALGORITHMS, FRAMES, SHARING, VARIANTS, BatchNormEncoder, Pictures, write
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_abisim import networks
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.extractors import ActionBisimExtractor, SSIExtractor, find_extractors
-from sb3_abisim.frozen import fuse, main
-from sb3_abisim.vec_env import VecEncodeObservations
+from sb3_abisim.networks import base as networks
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.rl.checks import find_extractors
+from sb3_abisim.rl.extractors import ActionBisimExtractor, SSIExtractor
+from sb3_abisim.rl.merge import fuse, main
+from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
 CONTINUOUS = ("SAC", "TD3", "TQC")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_abisim.analysis.leak import N_PATCHES, ActionLeakWarning, audit, leak_maps, paint_action
-from sb3_abisim.networks import ENCODERS
+from sb3_abisim.networks.base import ENCODERS
 
 GENERATOR = np.random.default_rng(0)
 

@@ -11,7 +11,7 @@ GOOD_RETURN = -60
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["PointMaze-v0", "DistractorPointMaze-v0"])
 def test_ppo_learns_on_a_frozen_encoder(tmp_path, env_id):
-    from sb3_abisim.zoo import main
+    from sb3_abisim.zoo.manager import main
 
     command = f"train --algo ppo --env {env_id} --conf-file abisim,frozen -n {N_TIMESTEPS} --seed 0 --verbose 0"
     faster = "-params n_envs:16 n_steps:128 batch_size:256 n_epochs:4 learning_rate:3e-4"

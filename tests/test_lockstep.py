@@ -11,7 +11,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_abisim.envs import ENV_IDS
-from sb3_abisim.lockstep import LockstepVecEnv
+from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 
 
 def make(env_id: str, cls: Any, n_envs: int = 3, **kwargs: Any) -> Any:
@@ -27,7 +27,7 @@ def same(ours: Any, theirs: Any) -> bool:
 
 @pytest.mark.parametrize("env_id", ["ScanNav-v0", "DistractorPointMaze-v0"])
 def test_fingerprints_are_passed_on(env_id: str) -> None:
-    ours, theirs = (make(env_id, cls, n_envs=2) for cls in (LockstepVecEnv, DummyVecEnv))
+    ours, theirs = (make(env_id, cls, n_envs=2) for cls in (BatchedVecEnv, DummyVecEnv))
     assert ours.get_attr("fingerprint") == theirs.get_attr("fingerprint") and len(ours.get_attr("fingerprint")[0]) == 64
 
 
@@ -35,7 +35,7 @@ def test_fingerprints_are_passed_on(env_id: str) -> None:
 def test_equals_dummy(env_id: str, tmp_path: Path) -> None:
     kwargs = {"monitor_kwargs": {"info_keywords": ("is_success",)}}
     ours, theirs = (
-        make(env_id, cls, monitor_dir=str(tmp_path / cls.__name__), **kwargs) for cls in (LockstepVecEnv, DummyVecEnv)
+        make(env_id, cls, monitor_dir=str(tmp_path / cls.__name__), **kwargs) for cls in (BatchedVecEnv, DummyVecEnv)
     )
     assert np.array_equal(ours.reset(), theirs.reset())
     ours.action_space.seed(0)
@@ -63,7 +63,7 @@ def test_equals_dummy(env_id: str, tmp_path: Path) -> None:
     for env in (ours, theirs):
         env.close()
     if ended:
-        files = [sorted((tmp_path / name).glob("*")) for name in ("LockstepVecEnv", "DummyVecEnv")]
+        files = [sorted((tmp_path / name).glob("*")) for name in ("BatchedVecEnv", "DummyVecEnv")]
         assert [file.name for file in files[0]] == [file.name for file in files[1]]
         for file, other in zip(*files, strict=True):
             episodes = [[line.split(",")[::3] for line in f.read_text().splitlines()[2:]] for f in (file, other)]
@@ -72,7 +72,7 @@ def test_equals_dummy(env_id: str, tmp_path: Path) -> None:
 
 def test_reset_options_of_one_copy_leave_the_others_alone() -> None:
     """ScanNav's goals: each copy walks to its own, and knows its own way."""
-    ours, theirs = (make("ScanNav-v0", cls, n_envs=2) for cls in (LockstepVecEnv, DummyVecEnv))
+    ours, theirs = (make("ScanNav-v0", cls, n_envs=2) for cls in (BatchedVecEnv, DummyVecEnv))
     theirs.reset()
     goals = [factors["goal"].tolist() for factors in theirs.env_method("factors")]
     scenes = [int(factors["scene"]) for factors in theirs.env_method("factors")]
@@ -90,7 +90,7 @@ def test_reset_options_of_one_copy_leave_the_others_alone() -> None:
 
 def test_the_generator_is_that_of_each_copy() -> None:
     """As with ``DummyVecEnv``: what draws from a copy's ``np_random`` moves its episodes."""
-    ours, theirs = (make("Nav2D-v0", cls, n_envs=2) for cls in (LockstepVecEnv, DummyVecEnv))
+    ours, theirs = (make("Nav2D-v0", cls, n_envs=2) for cls in (BatchedVecEnv, DummyVecEnv))
     for env in (ours, theirs):
         env.seed(5)
         env.reset()
@@ -100,7 +100,7 @@ def test_the_generator_is_that_of_each_copy() -> None:
 
 def test_arguments_and_pictures_reach_the_batch() -> None:
     kwargs = {"env_kwargs": {"layout": "corridor", "render_mode": "rgb_array"}}
-    ours, theirs = (make("Nav2D-v0", cls, **kwargs) for cls in (LockstepVecEnv, DummyVecEnv))
+    ours, theirs = (make("Nav2D-v0", cls, **kwargs) for cls in (BatchedVecEnv, DummyVecEnv))
     assert np.array_equal(ours.reset(), theirs.reset())
     assert np.array_equal(ours.render(), theirs.render())
     assert ours.env_is_wrapped(Monitor) == [True] * 3
@@ -108,10 +108,10 @@ def test_arguments_and_pictures_reach_the_batch() -> None:
 
 def test_refusals() -> None:
     with pytest.raises(ValueError, match=r"not made by gymnasium\.make of an id of sb3_abisim; use DummyVecEnv"):
-        make("CartPole-v1", LockstepVecEnv)
+        make("CartPole-v1", BatchedVecEnv)
     with pytest.raises(ValueError, match="must be made alike"):
-        LockstepVecEnv([lambda: gym.make("Nav2D-v0"), lambda: gym.make("PointMaze-v0")])
-    env = make("Nav2D-v0", LockstepVecEnv)
+        BatchedVecEnv([lambda: gym.make("Nav2D-v0"), lambda: gym.make("PointMaze-v0")])
+    env = make("Nav2D-v0", BatchedVecEnv)
     with pytest.raises(RuntimeError, match=r"call reset\(\) before step"):
         env.step(np.zeros(3, int))
     env.reset()
@@ -128,7 +128,7 @@ class Mirrored(gym.ActionWrapper[Any, Any, Any]):
 
 
 def test_wrappers_that_change_actions_are_noticed() -> None:
-    env = make("Nav2D-v0", LockstepVecEnv, wrapper_class=Mirrored)
+    env = make("Nav2D-v0", BatchedVecEnv, wrapper_class=Mirrored)
     env.reset()
     with pytest.raises(ValueError, match="use DummyVecEnv with wrappers that change actions"):
         env.step(np.zeros(3, int))

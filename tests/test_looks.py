@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_abisim.envs.looks import Looks
+from sb3_abisim.envs.backgrounds.color_jitter import Looks
 
 
 def test_before_a_draw_pictures_stay_as_they_are():

@@ -7,12 +7,12 @@ import index_env  # noqa: F401  registers ids
 import numpy as np
 import pytest
 
-from sb3_abisim import collect as collect_module
-from sb3_abisim import minari_io
-from sb3_abisim.collect import collect
-from sb3_abisim.dataset import TransitionDataset
-from sb3_abisim.dataset_format import CUT, INSIDE, TERMINATED, TRUNCATED
-from sb3_abisim.minari_io import export_dataset, import_dataset, main
+from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data.collect import collect
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED
+from sb3_abisim.data.readers import minari as minari_io
+from sb3_abisim.data.readers.minari import export_dataset, import_dataset, main
 
 minari = pytest.importorskip("minari")
 h5py = pytest.importorskip("h5py")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_abisim import analyze
+from sb3_abisim.analysis import command as analyze
 from sb3_abisim.analysis import nav2d_exact
 from sb3_abisim.analysis.nav2d_exact import (
     ENV_IDS,
@@ -26,8 +26,8 @@ from sb3_abisim.analysis.nav2d_exact import (
     reachable,
     spearman,
 )
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.networks import Nav2DEncoder
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.paper import Nav2DEncoder
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from analysis_inputs import Masked, file_of
 
-from sb3_abisim.analysis.neighbours import nearest_elsewhere, neighbours, similarity
+from sb3_abisim.analysis.neighbors import nearest_elsewhere, neighbours, similarity
 from sb3_abisim.analysis.scenes import sample_episodes
 from sb3_abisim.envs.nav2d import SIZE
 

@@ -8,7 +8,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_abisim.networks import ENCODERS, make_encoder
+from sb3_abisim.networks.base import ENCODERS, make_encoder
 
 
 def image_space(*shape):

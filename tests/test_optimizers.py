@@ -11,8 +11,8 @@ import torch as th
 from extractor_inputs import ALGORITHMS, Pictures, build, write
 from torch import nn
 
-from sb3_abisim.extractors import ActionBisimExtractor, VanillaExtractor
-from sb3_abisim.optimizers import EncoderLRAdam, mark_encoder
+from sb3_abisim.rl.extractors import ActionBisimExtractor, VanillaExtractor
+from sb3_abisim.rl.optimizers import EncoderLRAdam, mark_encoder
 
 # TRPO has no optimizer for its actor but its own; the optimizer of its policy trains the critic alone.
 WITH_OPTIMIZER = [name for name in ALGORITHMS if name != "TRPO"]
@@ -215,9 +215,9 @@ def test_from_yaml(path: Path) -> None:
     """The string of a zoo YAML, evaluated where the zoo evaluates it."""
     namespace = vars(importlib.import_module("rl_zoo3.exp_manager"))
     text = (
-        "dict(features_extractor_class=get_class_by_name('sb3_abisim.extractors.ActionBisimExtractor'), "
+        "dict(features_extractor_class=get_class_by_name('sb3_abisim.rl.extractors.ActionBisimExtractor'), "
         f"features_extractor_kwargs={{'encoder': {str(path)!r}}}, "
-        "optimizer_class=get_class_by_name('sb3_abisim.optimizers.EncoderLRAdam'), "
+        "optimizer_class=get_class_by_name('sb3_abisim.rl.optimizers.EncoderLRAdam'), "
         "optimizer_kwargs={'encoder_lr_factor': 0.1, 'eps': 1e-5})"
     )
     model = sb3.DQN("CnnPolicy", Pictures(), buffer_size=50, policy_kwargs=eval(text, namespace), device="cpu")

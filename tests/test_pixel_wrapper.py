@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_abisim.envs import top_down
-from sb3_abisim.envs.backgrounds import load_backgrounds
-from sb3_abisim.envs.pixel_wrapper import PointMazePixels
+from sb3_abisim.envs.backgrounds.load import load_backgrounds
+from sb3_abisim.envs.point_maze import top_down
+from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
 
 UP, DOWN, LEFT, RIGHT = range(4)
 

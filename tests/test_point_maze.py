@@ -14,8 +14,9 @@ from point_maze_inputs import solid_pixels
 from stable_baselines3.common.env_checker import check_env
 
 import sb3_abisim  # noqa: F401
-from sb3_abisim.envs import point_maze, top_down
-from sb3_abisim.envs.point_maze import PointMazeEnv, PointMazeVectorEnv, free_displacement, point_model
+from sb3_abisim.envs.point_maze import env as point_maze
+from sb3_abisim.envs.point_maze import top_down
+from sb3_abisim.envs.point_maze.env import PointMazeEnv, PointMazeVectorEnv, free_displacement, point_model
 
 UP, DOWN, LEFT, RIGHT = range(4)
 FAR = 100.0  # where an obstacle is out of the way

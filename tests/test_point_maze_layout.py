@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from point_maze_inputs import solid_pixels
 
-from sb3_abisim.envs import point_maze_layout
-from sb3_abisim.envs.point_maze import PointMazeVectorEnv
+from sb3_abisim.envs.point_maze import layout as point_maze_layout
+from sb3_abisim.envs.point_maze.env import PointMazeVectorEnv
 
 
 def reachable(solid: np.ndarray) -> np.ndarray:

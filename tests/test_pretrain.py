@@ -8,11 +8,11 @@ import pytest
 import torch as th
 from pretrain_inputs import SETTINGS, collect_grids, run
 
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.collect import main as collect
-from sb3_abisim.objectives import InverseDynamics
-from sb3_abisim.pretrain import main, pretrain
-from sb3_abisim.pretrain_config import PretrainConfig, load_config
+from sb3_abisim.data.collect import main as collect
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.objectives.inverse import InverseDynamics
+from sb3_abisim.pretraining.config import PretrainConfig, load_config
+from sb3_abisim.pretraining.pretrain import main, pretrain
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_the_commands_on_the_card_make_the_same_encoder(data, tmp_path, capsys):
 
 def test_abisim_trains_its_base_first(data, tmp_path, monkeypatch):
     small = load_config("ssi", "Nav2D-v0", SETTINGS)
-    monkeypatch.setattr("sb3_abisim.pretrain.load_config", lambda objective, env_id: small)
+    monkeypatch.setattr("sb3_abisim.pretraining.pretrain.load_config", lambda objective, env_id: small)
     output = run(data, tmp_path / "abisim.safetensors", "abisim")
     base = load_encoder(str(tmp_path / "abisim.base.safetensors"))
     contract = load_encoder(str(output)).contract
@@ -73,7 +73,9 @@ def test_abisim_trains_its_base_first(data, tmp_path, monkeypatch):
 
 
 def test_a_base_made_on_the_way_has_the_network_asked_for(data, tmp_path, monkeypatch):
-    monkeypatch.setattr("sb3_abisim.pretrain.load_config", lambda objective, env_id: PretrainConfig(**SETTINGS))
+    monkeypatch.setattr(
+        "sb3_abisim.pretraining.pretrain.load_config", lambda objective, env_id: PretrainConfig(**SETTINGS)
+    )
     output = run(data, tmp_path / "abisim.safetensors", "abisim", **{"network_kwargs.features_dim": 18})
     base = load_encoder(str(tmp_path / "abisim.base.safetensors"))
     assert base.encoder.features_dim == load_encoder(str(output)).encoder.features_dim == 18
@@ -176,7 +178,7 @@ def test_stops_at_numbers_that_are_not_finite(data, tmp_path, monkeypatch, where
 
 
 def test_held_out_transitions_are_not_trained_on(data, tmp_path, monkeypatch):
-    from sb3_abisim.dataset import TransitionDataset
+    from sb3_abisim.data.dataset import TransitionDataset
 
     plain_batches, plain_loss, seen = TransitionDataset.batches, InverseDynamics.loss, []
 
@@ -238,7 +240,7 @@ def test_too_little_to_hold_out_is_told_at_once(tmp_path, monkeypatch):
     # The base is trained on the same part, in batches that are no larger.
     config = load_config("abisim", "Nav2D-v0", {**SETTINGS, "batch_size": 8, "holdout": 0.0})
     base = load_config("ssi", "Nav2D-v0", {**SETTINGS, "n_updates": 3})
-    monkeypatch.setattr("sb3_abisim.pretrain.load_config", lambda *args: base)
+    monkeypatch.setattr("sb3_abisim.pretraining.pretrain.load_config", lambda *args: base)
     pretrain("abisim", tmp_path / "data", tmp_path / "abisim.safetensors", config, device="cpu", progress_bar=False)
     settings = load_encoder(tmp_path / "abisim.base.safetensors").contract["settings"]
     assert (settings["batch_size"], settings["holdout"]) == (8, 0.0)
@@ -246,7 +248,7 @@ def test_too_little_to_hold_out_is_told_at_once(tmp_path, monkeypatch):
 
 def test_numbers_without_a_dot(data, tmp_path):
     """YAML 1.1 takes 1e-4 for a text, users of the zoo do not."""
-    from sb3_abisim.pretrain import parse_overrides
+    from sb3_abisim.common.cli import parse_overrides
 
     words = ["learning_rate:1e-4", "objective_kwargs.l1_penalty:2e-3", "learning_rate:lin_1e-3"]
     assert parse_overrides(words[:2]) == {"learning_rate": 1e-4, "objective_kwargs.l1_penalty": 2e-3}
@@ -281,7 +283,7 @@ def test_weights_that_are_not_finite_are_never_saved(data, tmp_path, monkeypatch
 def test_missing_dataset(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["--objective", "ssi", "--env", "Nav2D-v0", "--data", str(tmp_path), "-o", "x.safetensors"])
-    assert "sb3_abisim.collect" in capsys.readouterr().err
+    assert "sb3_abisim.data.collect" in capsys.readouterr().err
 
 
 def test_learning_rate_schedule():
@@ -307,7 +309,7 @@ def test_learning_rate_reaches_the_optimizer(data, tmp_path, monkeypatch):
 def test_every_yaml_entry_is_valid(objective):
     import yaml
 
-    from sb3_abisim.resources import resource_path
+    from sb3_abisim.common.paths import resource_path
 
     entries = yaml.safe_load((resource_path("hyperparams") / "pretrain" / f"{objective}.yml").read_text())
     for env_id in entries:

@@ -5,11 +5,11 @@ import warnings
 import pytest
 from pretrain_inputs import collect_grids
 
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.dataset import TransitionDataset
-from sb3_abisim.pretrain import pretrain
-from sb3_abisim.pretrain_config import load_config
-from sb3_abisim.pretrain_run import PretrainRun
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.pretraining.config import load_config
+from sb3_abisim.pretraining.pretrain import pretrain
+from sb3_abisim.pretraining.trainer import PretrainRun
 
 # Learns nothing.
 SETTINGS = {"n_updates": 10, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5, "learning_rate": 1e-9}
@@ -55,7 +55,7 @@ def test_guessing_among_the_keys_that_are_held_out(data, tmp_path):
 
 def test_pretraining_keeps_freed_memory(data, tmp_path, monkeypatch):
     calls = []
-    monkeypatch.setattr("sb3_abisim.allocator.keep_freed_memory", lambda: calls.append(True))
+    monkeypatch.setattr("sb3_abisim.common.malloc.keep_freed_memory", lambda: calls.append(True))
     with pytest.warns(UserWarning, match="guessing"):
         run(data, tmp_path / "ssi.safetensors")
     assert calls

@@ -10,9 +10,9 @@ import time
 import pytest
 from pretrain_inputs import SETTINGS, collect_grids, run
 
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.pretrain import pretrain
-from sb3_abisim.pretrain_config import load_config
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.pretraining.config import load_config
+from sb3_abisim.pretraining.pretrain import pretrain
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, 
     # Different folders, equal names: what is compared must not hold the path.
     outputs = [tmp_path / name / "encoder.safetensors" for name in ("whole", "stopped")]
     pretrain(objective, data, outputs[0], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
-    from sb3_abisim.pretrain_run import PretrainRun
+    from sb3_abisim.pretraining.trainer import PretrainRun
 
     update, count = PretrainRun._update, 0
 
@@ -76,7 +76,8 @@ def test_killed_command_goes_on_to_the_same_bytes(data, tmp_path):
         return [
             sys.executable,
             "-m",
-            "sb3_abisim.pretrain",
+            "sb3_abisim",
+            "pretrain",
             "--objective",
             "ssi",
             "--env",
@@ -123,7 +124,7 @@ def test_finished_run_is_left_alone_and_other_settings_are_refused(data, tmp_pat
 
 
 def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretrain_run import PretrainRun
+    from sb3_abisim.pretraining.trainer import PretrainRun
 
     monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
@@ -132,7 +133,7 @@ def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):
 
 
 def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretrain_run import PretrainRun
+    from sb3_abisim.pretraining.trainer import PretrainRun
 
     monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
@@ -149,7 +150,7 @@ def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("log_interval", "n_rows", "saved"), [(7, 5, [14, 28]), (30, 1, [30]), (100, 1, [30])])
 def test_checkpoints_and_rows_come_whatever_the_intervals(data, tmp_path, monkeypatch, log_interval, n_rows, saved):
     """At the first row after each interval; the last row is at the end."""
-    from sb3_abisim.pretrain_run import PretrainRun
+    from sb3_abisim.pretraining.trainer import PretrainRun
 
     positions, plain = [], PretrainRun.save
     monkeypatch.setattr(PretrainRun, "save", lambda run: positions.append(run.n_updates) or plain(run))
@@ -161,7 +162,7 @@ def test_checkpoints_and_rows_come_whatever_the_intervals(data, tmp_path, monkey
 
 
 def test_keeps_the_last_two_checkpoints(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretrain_run import PretrainRun
+    from sb3_abisim.pretraining.trainer import PretrainRun
 
     monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
@@ -170,7 +171,7 @@ def test_keeps_the_last_two_checkpoints(data, tmp_path, monkeypatch):
 
 
 def test_second_writer_is_refused(data, tmp_path):
-    from sb3_abisim.atomic import folder_lock
+    from sb3_abisim.common.files import folder_lock
 
     (tmp_path / "ssi.run").mkdir()
     with folder_lock(tmp_path / "ssi.run"), pytest.raises(ValueError, match=str(os.getpid())):

@@ -19,7 +19,7 @@ from sb3_abisim.analysis.probes import (
     targets,
 )
 from sb3_abisim.analysis.scenes import sample_episodes
-from sb3_abisim.envs import top_down
+from sb3_abisim.envs.point_maze import top_down
 
 SHAPE = (3, 64, 64)
 

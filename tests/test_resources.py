@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from sb3_abisim import checkpoint, resources
-from sb3_abisim.checkpoint import EncoderNotFoundError, resolve_encoder
-from sb3_abisim.resources import cache_folder, resource_path
+from sb3_abisim.common import paths as resources
+from sb3_abisim.common.paths import cache_folder, resource_path
+from sb3_abisim.networks import encoder_file as checkpoint
+from sb3_abisim.networks.encoder_file import EncoderNotFoundError, resolve_encoder
 
 
 def test_resolve_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sb3_abisim.envs.scan_apartment import SEEDS, apartment_mesh
-from sb3_abisim.envs.scan_map import ScanMap
+from sb3_abisim.envs.scan_nav.apartment import SEEDS, apartment_mesh
+from sb3_abisim.envs.scan_nav.map import ScanMap
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -11,11 +11,11 @@ import trimesh
 from PIL import Image
 from scan_inputs import HEIGHT, TABLE, WALLS, box, floor, house, own_cache, write, y_up  # noqa: F401
 
-from sb3_abisim.envs import scan_map
-from sb3_abisim.envs.scan_files import SceneError
-from sb3_abisim.envs.scan_map import ScanMap, find_floors
-from sb3_abisim.envs.scan_mesh import load_mesh
-from sb3_abisim.resources import cache_folder
+from sb3_abisim.common.paths import cache_folder
+from sb3_abisim.envs.scan_nav import map as scan_map
+from sb3_abisim.envs.scan_nav.files import SceneError
+from sb3_abisim.envs.scan_nav.map import ScanMap, find_floors
+from sb3_abisim.envs.scan_nav.mesh import load_mesh
 
 
 def at(scan, x, y):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scan_inputs import empty_room
 
-from sb3_abisim.envs.scan_nav import ScanNavEnv
+from sb3_abisim.envs.scan_nav.env import ScanNavEnv
 
 NODE = 0.05
 

@@ -10,9 +10,9 @@ import trimesh
 from PIL import Image
 from scan_inputs import checkers, floor, own_cache, write  # noqa: F401
 
-from sb3_abisim.envs.scan_files import SceneError
-from sb3_abisim.envs.scan_map import ScanMap
-from sb3_abisim.envs.scan_mesh import load_mesh
+from sb3_abisim.envs.scan_nav.files import SceneError
+from sb3_abisim.envs.scan_nav.map import ScanMap
+from sb3_abisim.envs.scan_nav.mesh import load_mesh
 
 
 def edited(path, edit, binary=None):

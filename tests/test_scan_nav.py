@@ -11,10 +11,10 @@ from scipy import ndimage
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env
 
-from sb3_abisim.envs.scan_apartment import SEEDS, apartment_mesh
-from sb3_abisim.envs.scan_nav import ScanNavEnv, ScanNavVectorEnv, load_scene
-from sb3_abisim.envs.scan_view import MARKER_RADIUS, MARKERS, area_means
-from sb3_abisim.envs.scan_world import NODE, DistanceGrid, StartRule
+from sb3_abisim.envs.scan_nav.apartment import SEEDS, apartment_mesh
+from sb3_abisim.envs.scan_nav.env import ScanNavEnv, ScanNavVectorEnv, load_scene
+from sb3_abisim.envs.scan_nav.view import MARKER_RADIUS, MARKERS, area_means
+from sb3_abisim.envs.scan_nav.world import NODE, DistanceGrid, StartRule
 
 
 @pytest.fixture(scope="module")

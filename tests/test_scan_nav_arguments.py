@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scan_inputs import empty_room
 
-from sb3_abisim.envs.scan_files import SceneError
-from sb3_abisim.envs.scan_nav import ScanNavEnv
+from sb3_abisim.envs.scan_nav.env import ScanNavEnv
+from sb3_abisim.envs.scan_nav.files import SceneError
 
 
 @pytest.fixture(scope="module")

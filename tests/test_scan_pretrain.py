@@ -2,10 +2,10 @@
 
 import pytest
 
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.collect import collect
-from sb3_abisim.pretrain import OBJECTIVE_NAMES, pretrain
-from sb3_abisim.pretrain_config import load_config
+from sb3_abisim.data.collect import collect
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.pretraining.config import load_config
+from sb3_abisim.pretraining.pretrain import OBJECTIVE_NAMES, pretrain
 
 SETTINGS = {"n_updates": 4, "batch_size": 16, "log_interval": 2, "checkpoint_interval": 4, "holdout": 0}
 

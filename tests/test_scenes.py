@@ -6,9 +6,9 @@ import pytest
 
 from sb3_abisim.analysis.pixels import backgrounds_of, clips_of, swapped_backgrounds
 from sb3_abisim.analysis.scenes import draw_point_mazes, local_obstacles, position_in_picture, sample_episodes
-from sb3_abisim.envs import top_down
 from sb3_abisim.envs.nav2d import MOVES, SIZE
-from sb3_abisim.envs.point_maze_layout import to_pixels
+from sb3_abisim.envs.point_maze import top_down
+from sb3_abisim.envs.point_maze.layout import to_pixels
 
 
 @pytest.fixture(scope="module")

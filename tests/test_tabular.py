@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sb3_abisim.tabular import action_bisim_metric, behaviour_weights
+from sb3_abisim.analysis.exact_metric import action_bisim_metric, behaviour_weights
 
 # Three states: 0 -> 1 by action 0 and stays by action 1; 1 -> 2 by both; 2 stays.
 THREE = np.array([[1, 0], [2, 2], [2, 2]])

@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_abisim.envs import point_maze, point_maze_layout, top_down
-from sb3_abisim.envs.top_down import DiscPainter
+from sb3_abisim.envs.point_maze import env as point_maze
+from sb3_abisim.envs.point_maze import layout as point_maze_layout
+from sb3_abisim.envs.point_maze import top_down
+from sb3_abisim.envs.point_maze.top_down import DiscPainter
 
 SIZE = 16
 RADIUS = 1.2

@@ -13,9 +13,9 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 
-from sb3_abisim import networks
-from sb3_abisim.checkpoint import EncoderNotFoundError, load_encoder
-from sb3_abisim.vec_env import EncodedBox, VecEncodeObservations
+from sb3_abisim.networks import base as networks
+from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
+from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
 
 
 class Counter(gym.Env[Any, Any]):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from video_inputs import Image, av, both, own_cache, shade, shown, two_folders, videos_folder, write_frames, write_video  # noqa: F401
 
-from sb3_abisim.envs import video
-from sb3_abisim.envs.backgrounds import load_backgrounds
-from sb3_abisim.envs.distractors import DistractorPointMazeVectorEnv
+from sb3_abisim.envs.backgrounds import video
+from sb3_abisim.envs.backgrounds.load import load_backgrounds
+from sb3_abisim.envs.point_maze.distractors import DistractorPointMazeVectorEnv
 
 
 class TestDecoding:

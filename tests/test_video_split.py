@@ -3,8 +3,8 @@
 import pytest
 from video_inputs import both, own_cache, shown, videos_folder, write_frames, write_video  # noqa: F401
 
-from sb3_abisim.envs.backgrounds import load_backgrounds
-from sb3_abisim.envs.video_files import find_sources, natural_key, split_sources
+from sb3_abisim.envs.backgrounds.load import load_backgrounds
+from sb3_abisim.envs.backgrounds.video_files import find_sources, natural_key, split_sources
 
 
 def listed(folder, **kwargs):

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.resources import resource_path
+from sb3_abisim.common.paths import resource_path
+from sb3_abisim.networks.encoder_file import load_encoder
 
 ROOT = Path(__file__).resolve().parent.parent
 # All that a wheel is made of; copied, because a build leaves files behind.
@@ -49,7 +49,11 @@ def test_train_from_the_wheel_in_an_empty_folder(installed: Path, tmp_path: Path
     argv += ["--eval-freq", "-1", "-params", "n_envs:2", "n_steps:32", "batch_size:32"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(installed)}
     done = subprocess.run(
-        [sys.executable, "-m", "sb3_abisim.zoo", *argv], cwd=tmp_path, env=environment, capture_output=True, text=True
+        [sys.executable, "-m", "sb3_abisim.zoo.manager", *argv],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert f"Loading hyperparameters from: {installed / 'sb3_abisim' / 'hyperparams' / 'ppo.yml'}" in done.stdout

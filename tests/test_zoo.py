@@ -14,11 +14,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 from zoo_inputs import SMALL, write_encoder
 
-from sb3_abisim import zoo
-from sb3_abisim.checkpoint import load_encoder
+from sb3_abisim.common.paths import resource_path
 from sb3_abisim.envs import ENV_IDS
-from sb3_abisim.extractors import VanillaExtractor, check_trained_with
-from sb3_abisim.resources import resource_path
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.rl.checks import check_trained_with
+from sb3_abisim.rl.extractors import VanillaExtractor
+from sb3_abisim.zoo import manager as zoo
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
 
@@ -115,7 +116,7 @@ def test_frozen_puts_the_encoder_into_the_environment(manager: Any, algo: str, e
     ]:
         _, saved = manager(algo, env_id, word).read_hyperparameters()
         assert saved["vec_env_wrapper"] == [
-            {"sb3_abisim.vec_env.VecEncodeObservations": {"encoder": encoder, "objective": objective}}
+            {"sb3_abisim.rl.vec_encode.VecEncodeObservations": {"encoder": encoder, "objective": objective}}
         ]
         on_cpu = manager(algo, env_id, word, device="cpu").read_hyperparameters()[0]
         assert zoo.encoding_kwargs(on_cpu) == {"encoder": encoder, "objective": objective, "device": "cpu"}
@@ -133,7 +134,7 @@ def test_several_environments_are_stepped_as_one(manager: Any, tmp_path: Path) -
         return str(one.vec_env_class.__name__)
 
     (tmp_path / "own.yml").write_text("Nav2D-v0: {n_envs: 4, n_timesteps: 7, env_wrapper: some.Wrapper}\n")
-    assert vec_env_class("ppo") == vec_env_class("ppo", config="vanilla") == "LockstepVecEnv"
+    assert vec_env_class("ppo") == vec_env_class("ppo", config="vanilla") == "BatchedVecEnv"
     assert vec_env_class("dqn") == vec_env_class("ppo", hyperparams={"n_envs": 1}) == "DummyVecEnv"
     assert vec_env_class("ppo", config=str(tmp_path / "own.yml")) == "DummyVecEnv"
     assert vec_env_class("ppo", vec_env_type="subproc") == "SubprocVecEnv"
@@ -186,7 +187,7 @@ def test_every_entry_builds_its_model(manager: Any, tmp_path: Path, algo: str, e
 
 
 def test_shipped_encoders() -> None:
-    """Needs the files under encoders/, which come from `python -m sb3_abisim.pretrain`."""
+    """Needs the files under encoders/, which come from `sb3-abisim pretrain`."""
     for algo, env_id in ENTRIES:
         # 256 pixels take a network too large to ship.
         if env_id == "ScanNavPaper-v0":

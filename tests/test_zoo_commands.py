@@ -15,10 +15,11 @@ from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 from torch import nn
 from zoo_inputs import SMALL, write_encoder
 
-from sb3_abisim import frozen, zoo
-from sb3_abisim.benchmark.evaluate import evaluate_final
-from sb3_abisim.checkpoint import load_encoder
-from sb3_abisim.vec_env import VecEncodeObservations
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.rl import merge as frozen
+from sb3_abisim.rl.vec_encode import VecEncodeObservations
+from sb3_abisim.zoo import manager as zoo
+from sb3_abisim.zoo.evaluate import evaluate_final
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
 
@@ -172,7 +173,7 @@ def test_plain_zoo_command_in_the_checkout(tmp_path: Path) -> None:
 
 def test_zoo_command_elsewhere(tmp_path: Path) -> None:
     argv = ["--algo", "ppo", "--env", "Nav2D-v0", "-n", "64", "--eval-freq", "-1"]
-    argv += ["--gym-packages", "sb3_abisim.zoo", "--conf-file", "vanilla", "-params", *SMALL["ppo"]]
+    argv += ["--gym-packages", "sb3_abisim.zoo.manager", "--conf-file", "vanilla", "-params", *SMALL["ppo"]]
     done = _python("-m", "rl_zoo3.train", *argv, cwd=tmp_path)
     assert done.returncode == 0 and "Encoder features_extractor: VanillaExtractor" in done.stdout, done.stderr
 

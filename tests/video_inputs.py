@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_abisim.envs.backgrounds import load_backgrounds
+from sb3_abisim.envs.backgrounds.load import load_backgrounds
 
 av = pytest.importorskip("av")
 Image = pytest.importorskip("PIL.Image")

@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_abisim.checkpoint import save_encoder
-from sb3_abisim.networks import make_encoder
+from sb3_abisim.networks.base import make_encoder
+from sb3_abisim.networks.encoder_file import save_encoder
 
 SMALL = {
     "ppo": ["n_envs:2", "n_steps:32", "batch_size:32"],

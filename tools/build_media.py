@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sb3_abisim.atomic import write_atomic
-from sb3_abisim.envs.backgrounds import MEDIA_FOLDER, SIZE, digest_of, render_pan, split_groups
-from sb3_abisim.envs.video import decode_video, shrink
+from sb3_abisim.common.files import write_atomic
+from sb3_abisim.envs.backgrounds.clips import SIZE, digest_of, split_groups
+from sb3_abisim.envs.backgrounds.photo_pan import MEDIA_FOLDER, render_pan
+from sb3_abisim.envs.backgrounds.video import decode_video, shrink
 
 SEED = 0
 SHORT_SIDE = 112  # pixels of a stored photograph

@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from sb3_abisim.checkpoint import EncoderFile
+from sb3_abisim.networks.encoder_file import EncoderFile
 
 # What to show of an objective, the first of these that its card has, else the training loss.
 TERMS = ("test/accuracy", "test/metric", "test/reconstruction", "train/loss")

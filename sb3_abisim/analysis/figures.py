@@ -10,11 +10,12 @@ from typing import Any
 
 import gymnasium as gym
 
-from sb3_abisim.analysis import curves, leak, neighbours, perturbation, pixels, plots, plots_pixels, probes, sweep
-from sb3_abisim.atomic import write_atomic
-from sb3_abisim.checkpoint import EncoderFile, load_encoder
+from sb3_abisim.analysis import curves, leak, perturbation, pixels, plots, plots_pixels, probes, sweep
+from sb3_abisim.analysis import neighbors as neighbours
+from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.paths import resource_path
 from sb3_abisim.envs import ENV_IDS
-from sb3_abisim.resources import resource_path
+from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
 
 NAV2D_IDS = ("Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0")
 SHIPPED_IDS = ("Nav2D-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "DistractorPointMaze-v0")

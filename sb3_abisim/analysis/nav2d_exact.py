@@ -3,7 +3,7 @@
 A perturbation map answers: by how much does the distance between two states grow when one cell of the grid is toggled
 (an obstacle added or removed) and the agent stands where it stood? The learned answer is the L1 distance of the two
 embeddings; the exact one is the fixed point of the action-bisimulation metric whose base distance is that of the base
-encoder (:mod:`sb3_abisim.tabular`). Both are averaged over layouts and agents by the offset from agent to cell.
+encoder (:mod:`sb3_abisim.analysis.exact_metric`). Both are averaged over layouts and agents by the offset from agent to cell.
 
 The goal counts as any other cell here: the metric knows no reward, and random play passes over it.
 """
@@ -18,9 +18,9 @@ import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import preprocess_obs
 
+from sb3_abisim.analysis.exact_metric import action_bisim_metric
 from sb3_abisim.envs.nav2d import CHANNELS, GOAL, SIZE, next_cells
-from sb3_abisim.networks import Encoder
-from sb3_abisim.tabular import action_bisim_metric
+from sb3_abisim.networks.base import Encoder
 
 N_CELLS = SIZE * SIZE
 GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
@@ -255,7 +255,7 @@ class ExactReference:
         )
 
     def terms(self, encoder: Encoder) -> dict[str, float]:
-        """The comparison as numbers for a log: the ``callback`` of :func:`sb3_abisim.pretrain.pretrain`.
+        """The comparison as numbers for a log: the ``callback`` of :func:`sb3_abisim.pretraining.pretrain.pretrain`.
 
         :param encoder: any encoder of Nav2D, in evaluation mode
         """

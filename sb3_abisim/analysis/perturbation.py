@@ -25,9 +25,9 @@ from sb3_abisim.analysis.nav2d_exact import (
     profile,
     reachable,
 )
-from sb3_abisim.checkpoint import EncoderFile
 from sb3_abisim.envs.nav2d import LAYOUTS, OBSTACLE_SIZE, SIZE
-from sb3_abisim.networks import Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.encoder_file import EncoderFile
 
 # Regions of the violins by the larger of the two coordinate distances from the agent, in cells. The paper shows a
 # picture of its regions and no numbers.

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
 from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, sample_episodes
-from sb3_abisim.checkpoint import EncoderFile
-from sb3_abisim.envs.backgrounds import SPLITS, Backgrounds, load_backgrounds
-from sb3_abisim.envs.point_maze import ROOM_SIZE
-from sb3_abisim.envs.point_maze_layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE
-from sb3_abisim.envs.top_down import AGENT_RADIUS, DIRECTIONS
-from sb3_abisim.networks import Encoder
+from sb3_abisim.envs.backgrounds.clips import SPLITS, Backgrounds
+from sb3_abisim.envs.backgrounds.load import load_backgrounds
+from sb3_abisim.envs.point_maze.env import ROOM_SIZE
+from sb3_abisim.envs.point_maze.layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE
+from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.encoder_file import EncoderFile
 
 ENV_IDS = ("PointMaze-v0", "DistractorPointMaze-v0", "ContinuousPointMaze-v0", "ContinuousDistractorPointMaze-v0")
 STEP = 1.0  # m, how far an obstacle or the agent is moved

@@ -60,7 +60,7 @@ def _show_changes(axis: Any, here: dict[str, Any]) -> None:
 def draw_neighbours(results: dict[str, Any], path: Path) -> None:
     """Queries in the first row, each encoder's nearest neighbours below with their distances; settings side by side.
 
-    :param results: of :func:`~sb3_abisim.analysis.neighbours.neighbours`
+    :param results: of :func:`~sb3_abisim.analysis.neighbors.neighbours`
     :param path: the PNG
     """
     plt = pyplot()

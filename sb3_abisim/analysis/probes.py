@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from sb3_abisim.analysis.nav2d_exact import embed
 from sb3_abisim.analysis.pixels import backgrounds_of, clip_settings, clips_of, swapped_backgrounds
 from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, local_obstacles, position_in_picture, sample_episodes
-from sb3_abisim.checkpoint import EncoderFile
-from sb3_abisim.networks import Encoder, make_encoder
+from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.networks.encoder_file import EncoderFile
 
 PER_EPISODE = 10
 PROBES = ("linear", "MLP")

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import HELD_OUT_SEED
-from sb3_abisim.collect import collect_shard, make_vector_env
-from sb3_abisim.envs import top_down
-from sb3_abisim.envs.backgrounds import composite
+from sb3_abisim.data.collect import collect_shard, make_vector_env
+from sb3_abisim.envs.backgrounds.player import composite
 from sb3_abisim.envs.base import BatchEnv
 from sb3_abisim.envs.nav2d import SIZE
-from sb3_abisim.envs.point_maze import ROOM_SIZE
-from sb3_abisim.envs.point_maze_layout import (
+from sb3_abisim.envs.point_maze import top_down
+from sb3_abisim.envs.point_maze.env import ROOM_SIZE
+from sb3_abisim.envs.point_maze.layout import (
     GOAL_MASK,
     OBSTACLE_PIXELS,
     PIXELS_PER_METRE,
@@ -21,8 +21,8 @@ from sb3_abisim.envs.point_maze_layout import (
     static_layer,
     to_pixels,
 )
-from sb3_abisim.envs.scan_apartment import SEEDS
-from sb3_abisim.envs.scan_map import ScanMap
+from sb3_abisim.envs.scan_nav.apartment import SEEDS
+from sb3_abisim.envs.scan_nav.map import ScanMap
 
 # Copies collected at once; 64 x 64 pictures of a whole episode take 1.6 MB.
 N_COPIES = 50

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from sb3_abisim.checkpoint import EncoderFile, load_encoder
-from sb3_abisim.pretrain import pretrain, read_env_id
-from sb3_abisim.pretrain_config import load_config
+from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
+from sb3_abisim.pretraining.config import load_config
+from sb3_abisim.pretraining.pretrain import pretrain, read_env_id
 
 PAPER_C = (0.25, 0.75, 0.85, 0.99)
 

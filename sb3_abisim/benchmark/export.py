@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.atomic import write_atomic
-from sb3_abisim.benchmark.runs import TRAINING_CURVE, NoEpisodesError, Run, find_runs
+from sb3_abisim.common.files import write_atomic
+from sb3_abisim.zoo.runs import TRAINING_CURVE, NoEpisodesError, Run, find_runs
 
 INDEX_NAME = "benchmark.json"
 TEXTS = ("args.yml", "config.yml", "command.txt")

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_abisim.atomic import write_atomic
-from sb3_abisim.benchmark import statistics
-from sb3_abisim.benchmark.cell import is_done
-from sb3_abisim.benchmark.engine import Engine, run_cells
-from sb3_abisim.benchmark.graph import Cell, Plan, build
-from sb3_abisim.benchmark.runs import Curve, read_run
-from sb3_abisim.pretrain import OBJECTIVE_NAMES
+from sb3_abisim.benchmark.jobs.job import is_done
+from sb3_abisim.benchmark.jobs.local import Engine, run_cells
+from sb3_abisim.benchmark.plan import Cell, Plan, build
+from sb3_abisim.benchmark.report import statistics
+from sb3_abisim.common.files import write_atomic
+from sb3_abisim.registry import get_objective, methods
+from sb3_abisim.zoo.runs import Curve, read_run
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -72,7 +72,7 @@ def parse_space(words: Sequence[str], objective: str) -> dict[str, "BaseDistribu
     space: dict[str, BaseDistribution] = {}
     for word in words:
         name, equals, values = word.partition("=")
-        if name.partition(".")[0] not in OBJECTIVE_NAMES:
+        if name.partition(".")[0] not in methods():
             name = f"{objective}.{name}"
         if name in space:
             raise ValueError(f"{name} is given twice")
@@ -124,8 +124,7 @@ def sweep(
     if len(plan.methods) != 1 or len(plan.env_ids) != 1:
         raise ValueError(f"a sweep takes one method and one environment, got {plan.methods} and {plan.env_ids}")
     objective = plan.methods[0].partition(",")[0]
-    if objective not in OBJECTIVE_NAMES:
-        raise ValueError(f"a sweep pretrains one of {', '.join(OBJECTIVE_NAMES)}, got {plan.methods[0]!r}")
+    get_objective(objective)
     for name, count in (("n_trials", n_trials), ("batch", batch)):
         if count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")

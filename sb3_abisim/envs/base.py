@@ -291,6 +291,19 @@ class SingleEnv(gym.Env):
         return None if frames is None else frames[0]
 
 
+def batch_class(env_id: str) -> type[BatchEnv] | None:
+    """The class of an environment's batch.
+
+    :param env_id: any id
+    :return: None for an id that is not registered, or is no environment of this kind
+    """
+    spec = gym.registry.get(env_id)
+    creator: Any = None if spec is None else spec.vector_entry_point
+    if isinstance(creator, str):
+        creator = gym.envs.registration.load_env_creator(creator)
+    return creator if isinstance(creator, type) and issubclass(creator, BatchEnv) else None
+
+
 def one_of(observations: Any, index: int, copy: bool = False) -> Any:
     """One observation of a batch.
 

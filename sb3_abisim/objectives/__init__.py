@@ -1,24 +1,12 @@
-"""The pretraining objectives, by the name that commands, files and extractors use."""
+"""The pretraining objectives, a file each, which registers itself; a new file in this folder is found by itself."""
 
-from sb3_abisim.objectives.action_bisim import ActionBisimulation
-from sb3_abisim.objectives.base import Objective, TensorBatch
-from sb3_abisim.objectives.beta_vae import BetaVAE
-from sb3_abisim.objectives.curl import CURL
-from sb3_abisim.objectives.info_nce import InfoNCE
-from sb3_abisim.objectives.inverse import ACRO, InverseDynamics
+import importlib
+import pkgutil
 
-OBJECTIVES: dict[str, type[Objective]] = {
-    cls.name: cls for cls in (InverseDynamics, ACRO, BetaVAE, CURL, InfoNCE, ActionBisimulation)
-}
+from sb3_abisim.registry import register_method
 
-__all__ = [
-    "ACRO",
-    "CURL",
-    "OBJECTIVES",
-    "ActionBisimulation",
-    "BetaVAE",
-    "InfoNCE",
-    "InverseDynamics",
-    "Objective",
-    "TensorBatch",
-]
+for _module in pkgutil.iter_modules(__path__):
+    importlib.import_module(f"{__name__}.{_module.name}")
+
+# The baseline that pretrains nothing.
+register_method("vanilla", label="trained from scratch", extractor="VanillaExtractor", color="#D55E00")

@@ -42,8 +42,10 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
-from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.heads import MLP
 from sb3_abisim.objectives.base import Objective, TensorBatch
+from sb3_abisim.registry import register_method
 
 LOSSES = {"l1": nn.functional.l1_loss, "smooth_l1": nn.functional.smooth_l1_loss, "mse": nn.functional.mse_loss}
 EXPECTATIONS = ("uniform", "behaviour")
@@ -325,3 +327,15 @@ class ActionBisimulation(Objective):
         interval = self.forward_reset_interval
         if self.forward_model is not None and interval is not None and int(self.n_updates) % interval == 0:
             self.forward_model.reset()
+
+
+register_method(
+    "abisim",
+    ActionBisimulation,
+    label="action-bisimulation",
+    extractor="ActionBisimExtractor",
+    base="ssi",
+    color="#0072B2",
+    curve="metric",
+    results=("metric", "distance"),
+)

@@ -7,7 +7,7 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
-from sb3_abisim.networks import Encoder
+from sb3_abisim.networks.base import Encoder
 
 
 @dataclass(frozen=True)

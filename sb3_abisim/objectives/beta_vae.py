@@ -21,9 +21,10 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
-from sb3_abisim.decoder import Decoder
-from sb3_abisim.networks import Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.decoder import Decoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
+from sb3_abisim.registry import register_method
 
 _LOG_STD_RANGE = (-5.0, 2.0)
 
@@ -75,3 +76,14 @@ class BetaVAE(Objective):
         loss, terms = beta_vae_loss(logits, batch.observations, mean, log_std, self.kl_weight)
         terms["squared_error"] = (logits.sigmoid() - batch.observations).pow(2).mean()
         return loss, {name: term.detach() for name, term in terms.items()}
+
+
+register_method(
+    "beta_vae",
+    BetaVAE,
+    label="β-VAE",
+    extractor="BetaVAEExtractor",
+    color="#56B4E9",
+    curve="reconstruction",
+    results=("squared_error", "kl"),
+)

@@ -20,9 +20,10 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
-from sb3_abisim.augmentations import AUGMENTATIONS
-from sb3_abisim.networks import Encoder
+from sb3_abisim.networks.augmentations import AUGMENTATIONS
+from sb3_abisim.networks.base import Encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
+from sb3_abisim.registry import register_method
 
 
 def curl_loss(query: th.Tensor, key: th.Tensor, weight: th.Tensor) -> tuple[th.Tensor, dict[str, th.Tensor]]:
@@ -44,7 +45,7 @@ class CURL(Objective):
     :param encoder: the network to pretrain
     :param action_space: not used by the loss
     :param augmentation: "noise" (the paper), "shift" or "crop"
-    :param strength: of the augmentation, above 0 (see :mod:`sb3_abisim.augmentations`)
+    :param strength: of the augmentation, above 0 (see :mod:`sb3_abisim.networks.augmentations`)
     :param tau: rate of the key encoder, per update
     """
 
@@ -95,3 +96,6 @@ class CURL(Objective):
         """Move the key encoder, ``k <- tau q + (1 - tau) k``."""
         for key, query in zip(self.key_encoder.parameters(), self.encoder.parameters(), strict=True):
             key.lerp_(query, self.tau)
+
+
+register_method("curl", CURL, label="CURL", extractor="CURLExtractor", color="#E69F00")

@@ -26,8 +26,10 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
-from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.heads import MLP
 from sb3_abisim.objectives.base import Objective, TensorBatch
+from sb3_abisim.registry import register_method
 
 HIDDEN_DIM = 256
 
@@ -104,3 +106,6 @@ class InfoNCE(Objective):
         l1_norm = (psi.abs().sum(dim=1) + psi_next.abs().sum(dim=1)).mean()
         terms["l1_norm"] = l1_norm
         return loss + self.l1_penalty * l1_norm, {name: term.detach() for name, term in terms.items()}
+
+
+register_method("info_nce", InfoNCE, label="InfoNCE", extractor="InfoNCEExtractor", color="#000000")

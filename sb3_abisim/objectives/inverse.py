@@ -22,8 +22,10 @@ import gymnasium as gym
 import torch as th
 from torch import nn
 
-from sb3_abisim.networks import MLP, Encoder
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.heads import MLP
 from sb3_abisim.objectives.base import Objective, TensorBatch
+from sb3_abisim.registry import register_method
 
 ADAPTIVE_FORMS = ("paper", "released", "above_chance")
 HIDDEN_DIM = 256
@@ -155,3 +157,7 @@ class ACRO(InverseDynamics):
         """
         if k in (1, [1, 1]):
             raise ValueError("acro needs k > 1, got k = 1, which is ssi")
+
+
+register_method("ssi", InverseDynamics, label="single-step inverse dynamics", extractor="SSIExtractor", color="#009E73")
+register_method("acro", ACRO, label="multi-step inverse dynamics (ACRO)", extractor="ACROExtractor", color="#CC79A7")

@@ -1,0 +1,124 @@
+"""Nearest neighbours in embedding space: what do states that an encoder takes for alike have in common?
+
+A state's neighbour is the nearest state (L1 distance of embeddings) of any other episode, so in another layout. If the
+encoder follows the agent, neighbours have it in like places; if it follows obstacles, neighbours have like
+surroundings; if it follows the background, neighbours share their clip. Each is held against random pairs of states.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from sb3_abisim.analysis.nav2d_exact import embed
+from sb3_abisim.analysis.pixels import clip_settings
+from sb3_abisim.analysis.scenes import Samples, local_obstacles, position_in_picture, sample_episodes
+from sb3_abisim.networks.encoder_file import EncoderFile
+
+PER_EPISODE = 10
+N_PICTURED = 4
+
+
+def neighbours(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
+    """Nearest neighbours among states of held-out layouts, by setting (:func:`clip_settings`).
+
+    :param files: encoders by name
+    :param env_id: a registered id of ours
+    :param n_episodes: :data:`PER_EPISODE` states of each make up the pool, and every one of them is a query
+    :param seed: of the episodes
+    :return: ``settings``: per encoder and for random pairs ``agent`` (mean distance of the two agents, in cells or
+        metres), ``obstacles`` (correlation of the surroundings, :func:`similarity`), ``same_clip`` (share; None without
+        clips), and ``examples`` of a few queries; ``pictures``, not for JSON: by setting, the queries' and each
+        encoder's neighbours'
+    """
+    settings, pictures = {}, {}
+    for setting, env_kwargs in clip_settings(env_id).items():
+        samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, env_kwargs)
+        settings[setting], pictures[setting] = _setting(files, samples, seed)
+    digests = {name: file.digest for name, file in files.items()}
+    return {"per_episode": PER_EPISODE, "digests": digests, "settings": settings, "pictures": pictures}
+
+
+def _setting(
+    files: dict[str, EncoderFile], samples: Samples, seed: int
+) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
+    generator = np.random.default_rng(seed)
+    queries = generator.choice(len(samples), N_PICTURED, replace=False)
+    numbers: dict[str, Any] = {}
+    pictures = {"query": samples.frames[queries]}
+    for name, file in files.items():
+        nearest, distances = nearest_elsewhere(embed(file.encoder.eval(), samples.frames), samples.episodes)
+        examples = _pair_numbers(samples, queries, nearest[queries])
+        examples["distance"] = _relative(distances)[queries].tolist()
+        numbers[name] = {**similarity(samples, nearest), "examples": examples}
+        pictures[name] = samples.frames[nearest[queries]]
+    numbers["random pairs"] = similarity(samples, _random_elsewhere(samples.episodes, generator))
+    return numbers, pictures
+
+
+def _relative(distances: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Distances in units of their mean over all queries."""
+    relative: NDArray[np.float64] = distances.astype(np.float64) / distances.mean()
+    return relative
+
+
+def nearest_elsewhere(
+    features: th.Tensor, episodes: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The nearest row of another episode for each row, and its L1 distance.
+
+    :param features: (n, features_dim)
+    :param episodes: which episode, (n,); at least two different ones
+    :raises ValueError: if there is one episode only
+    """
+    if len(np.unique(episodes)) < 2:
+        raise ValueError("neighbours are sought in other episodes, got one episode; use at least 2")
+    nearest, distances = [], []
+    numbers = th.as_tensor(episodes)
+    for rows in th.split(th.arange(len(features)), 512):
+        table = th.cdist(features[rows], features, p=1.0)
+        table[numbers[rows][:, None] == numbers[None]] = th.inf
+        least = table.min(dim=1)
+        nearest.append(least.indices)
+        distances.append(least.values)
+    return th.cat(nearest).numpy(), th.cat(distances).numpy()
+
+
+def similarity(samples: Samples, partners: NDArray[np.int64]) -> dict[str, Any]:
+    """What samples and their partners have in common, mean over samples.
+
+    :param samples: with factors
+    :param partners: index of each sample's partner, (n,)
+    :return: ``agent``, ``obstacles``, ``same_clip`` as in :func:`neighbours`; the surroundings are correlated as 24
+        numbers 0 or 1 each less their mean over all samples, so that 0 is what chance gives
+    """
+    everyone = np.arange(len(samples))
+    pairs = _pair_numbers(samples, everyone, partners)
+    blocked = local_obstacles(samples.factors).astype(np.float64)
+    blocked -= blocked.mean(axis=0)
+    correlation = (blocked * blocked[partners]).sum() / (blocked**2).sum()
+    return {
+        "agent": float(np.mean(pairs["agent"])),
+        "obstacles": float(correlation),
+        "same_clip": None if pairs["same_clip"] is None else float(np.mean(pairs["same_clip"])),
+    }
+
+
+def _pair_numbers(samples: Samples, first: NDArray[np.int64], second: NDArray[np.int64]) -> dict[str, Any]:
+    agents = position_in_picture(samples.factors)
+    blocked = local_obstacles(samples.factors)
+    clips = samples.factors.get("clip_id")
+    return {
+        "agent": np.linalg.norm(agents[first] - agents[second], axis=1).tolist(),
+        "obstacles": (blocked[first] == blocked[second]).mean(axis=1).tolist(),
+        "same_clip": None if clips is None else (clips[first] == clips[second]).tolist(),
+    }
+
+
+def _random_elsewhere(episodes: NDArray[np.int64], generator: np.random.Generator) -> NDArray[np.int64]:
+    """A random row of another episode for each row."""
+    partners = generator.integers(len(episodes), size=len(episodes))
+    while (same := episodes[partners] == episodes).any():
+        partners[same] = generator.integers(len(episodes), size=same.sum())
+    return partners

@@ -1,0 +1,216 @@
+"""Run one cell: ``python -m sb3_abisim.benchmark.jobs.job`` with the cell as a line of JSON on standard input.
+
+An engine starts this program, here or on another machine. It holds standard input open: when the engine dies, however
+it dies, the input ends and the command is killed with all that it started, so that no orphan goes on writing.
+"""
+
+import contextlib
+import json
+import os
+import platform
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import sb3_abisim
+from sb3_abisim._version import __version__
+from sb3_abisim.benchmark.jobs.source_hash import source_digest
+from sb3_abisim.common.files import FolderLockedError, file_digest, folder_lock, write_atomic
+
+# A worker that was lost may take this long to die and to let go of its cell.
+LOCK_PATIENCE_SECONDS = 60.0
+LOG_TAIL_LINES = 15
+
+
+def marker_path(root: Path, name: str) -> Path:
+    """The file that says that a cell is done, and how it came about.
+
+    :param root: the benchmark's folder
+    :param name: of the cell
+    """
+    return root / "cells" / f"{name}.json"
+
+
+def is_done(root: Path, cell: dict[str, Any]) -> bool:
+    """Whether the output is there and still what was made.
+
+    :param root: the benchmark's folder
+    :param cell: what :meth:`~sb3_abisim.benchmark.plan.Cell.to_json` gave
+    """
+    try:
+        marker = json.loads(marker_path(root, cell["name"]).read_bytes())
+        return bool(marker["digest"] == file_digest(root / cell["output"] / cell["proof"]))
+    except FileNotFoundError:
+        return False
+
+
+def is_by_other_code(root: Path, cell: dict[str, Any]) -> bool:
+    """Whether a cell that is done was made by other code than this; False where its marker does not say.
+
+    :param root: the benchmark's folder
+    :param cell: what :meth:`~sb3_abisim.benchmark.plan.Cell.to_json` gave
+    """
+    source = json.loads(marker_path(root, cell["name"]).read_bytes()).get("source")
+    return source is not None and source != source_digest(cell["kind"])
+
+
+class CellError(RuntimeError):
+    """A cell's command failed; the message ends with the last lines of its log."""
+
+
+def launch(
+    root: Path,
+    cell: dict[str, Any],
+    threads: int,
+    started: Callable[["subprocess.Popen[bytes]"], object] = lambda process: None,
+) -> None:
+    """Run a cell in a program of its own and wait for its end.
+
+    :param root: the benchmark's folder
+    :param cell: what :meth:`~sb3_abisim.benchmark.plan.Cell.to_json` gave
+    :param threads: for the command's libraries
+    :param started: called with the process, so that it can be stopped
+    :raises CellError: when it failed
+    """
+    log = root / "logs" / f"{cell['name']}.log"
+    log.parent.mkdir(exist_ok=True)
+    package = str(Path(sb3_abisim.__file__).resolve().parent.parent)
+    path = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    environment = {**os.environ, **dict.fromkeys(names, str(threads)), "PYTHONPATH": path}
+    with open(log, "ab") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "sb3_abisim.benchmark.jobs.job"],
+            cwd=root, env=environment, stdin=subprocess.PIPE, stdout=file, stderr=file, start_new_session=True,
+        )  # fmt: skip
+    started(process)
+    assert process.stdin is not None
+    try:
+        process.stdin.write(json.dumps(cell).encode() + b"\n")
+        process.stdin.flush()
+    except BrokenPipeError:
+        pass  # it has died already; its status says so
+    try:
+        code = process.wait()
+    except BaseException:
+        kill(process)
+        raise
+    process.stdin.close()
+    if code:
+        kill(process)
+        tail = "\n  ".join(log.read_text(errors="replace").splitlines()[-LOG_TAIL_LINES:])
+        raise CellError(f"{cell['title']} failed (exit status {code}); {log} ends with\n  {tail}")
+
+
+def kill(process: "subprocess.Popen[bytes]") -> None:
+    """End a program that :func:`launch` started, and all that it started.
+
+    :param process: as given to ``started``
+    """
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def main() -> None:
+    """Run the cell that standard input names, in the working directory, which is the benchmark's folder."""
+    line = b""
+    while not line.endswith(b"\n"):
+        line += os.read(0, 1 << 16) or sys.exit("the engine died before it named a cell")
+    cell = json.loads(line)
+    threading.Thread(target=_die_with_engine, daemon=True).start()
+    root = Path.cwd()
+    work = root / "work" / cell["name"]
+    work.mkdir(parents=True, exist_ok=True)
+    deadline = time.monotonic() + LOCK_PATIENCE_SECONDS
+    while True:
+        try:
+            with folder_lock(work):
+                _run(root, work, cell)
+            break
+        except FolderLockedError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.5)
+    shutil.rmtree(work, ignore_errors=True)
+
+
+def _die_with_engine() -> None:
+    # Not through sys.stdin, whose lock a thread must not hold when Python ends.
+    while os.read(0, 1):
+        pass
+    os.killpg(os.getpgrp(), signal.SIGKILL)
+
+
+def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
+    if is_done(root, cell):
+        return  # by a worker that was thought lost
+    output = root / cell["output"]
+    output.parent.mkdir(parents=True, exist_ok=True)
+    if cell["kind"] == "run":
+        if output.exists():
+            raise ValueError(f"{output} is there, but not as it was made; move it away, then run the command again")
+        # The zoo cannot go on where it was killed.
+        for leftover in work.iterdir():
+            if leftover.is_dir():
+                shutil.rmtree(leftover)
+    if cell["kind"] == "encoder" and output.is_file() and marker_path(root, cell["name"]).is_file():
+        # Not as it was made; pretraining would find it finished and refuse it.
+        damaged = output.with_suffix(".damaged")
+        output.rename(damaged)
+        print(f"{output} is not as it was made; it is now {damaged}", flush=True)
+    start, source = time.monotonic(), source_digest(cell["kind"])
+    print(f"$ python -m {' '.join(cell['command'])}", flush=True)
+    code = subprocess.run([sys.executable, "-m", *cell["command"]], stdin=subprocess.DEVNULL).returncode
+    if code:
+        sys.exit(code if code > 0 else 1)
+    made = next(work.glob(f"*/{cell['settings']['env_id']}_1")) if cell["kind"] == "run" else output
+    content = {
+        **cell,
+        "digest": file_digest(made / cell["proof"]),
+        "seconds": round(time.monotonic() - start, 1),
+        "source": source,
+        "host": socket.gethostname(),
+        "versions": {"sb3_abisim": __version__, "python": platform.python_version(), **_versions()},
+        "hardware": hardware(),
+    }
+    marker = marker_path(root, cell["name"])
+    marker.parent.mkdir(exist_ok=True)
+    write_atomic(marker, lambda file: file.write(json.dumps(content, indent=1).encode()))
+    if made != output:
+        # After the marker: a kill in between leaves no folder that would stand in the way.
+        made.rename(output)
+
+
+def _versions() -> dict[str, str]:
+    """Of what the numbers rest on."""
+    names = ("torch", "numpy", "gymnasium", "mujoco", "stable_baselines3", "sb3_contrib", "rl_zoo3")
+    return {name: metadata.version(name) for name in names}
+
+
+def hardware() -> dict[str, Any]:
+    """Processor, how many of them this process may use, and graphics cards."""
+    found = None
+    with contextlib.suppress(OSError):
+        found = re.search(r"^model name\s*: (.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    model = found.group(1) if found else platform.machine()
+    cards: list[str] = []
+    with contextlib.suppress(OSError):
+        query = ["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]
+        answer = subprocess.run(query, capture_output=True, text=True)
+        cards = answer.stdout.splitlines() if answer.returncode == 0 else []
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": model, "n_processors": count, "graphics_cards": cards}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,260 @@
+"""The pictures of a report."""
+
+import io
+import itertools
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sb3_abisim.benchmark.report.tables import Comparison, Group, Row
+from sb3_abisim.registry import methods
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart, and two more for whatever else is compared.
+PALETTE = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F",
+)  # fmt: skip
+GREY = "#6b7280"
+DPI = 150
+MINUS = "\N{MINUS SIGN}"
+SPLIT_NAMES = {"eval": "unseen clips", "train": "clips seen in training", "clean": "no clips"}
+_STYLE: Any = {
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": "#374151",
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "xtick.color": GREY,
+    "ytick.color": GREY,
+    "axes.grid": True,
+    "grid.color": "#e5e7eb",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "figure.constrained_layout.use": True,
+}
+
+
+def level_text(value: float) -> str:
+    """A return as a reader sees it.
+
+    :param value: four digits of it are enough
+    """
+    return f"{value:.4g}".replace("-", MINUS)
+
+
+def draw(comparison: Comparison) -> dict[str, bytes]:
+    """All pictures that the comparison has numbers for.
+
+    :param comparison: what to draw
+    :return: name without ending to PNG file
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    labels = list(dict.fromkeys(label for methods in comparison.groups.values() for label in methods))
+    labels.sort(key=lambda label: label != comparison.reference)
+    colours = assign_colours(labels)
+    pictures = {}
+    functions = {
+        "curves": _curves, "thresholds": _thresholds, "splits": _splits, "aggregates": _aggregates,
+        "profiles": _profiles, "improvement": _improvement,
+    }  # fmt: skip
+    with plt.rc_context(_STYLE):
+        for name, function in functions.items():
+            figure = function(comparison, colours)
+            if figure is not None:
+                buffer = io.BytesIO()
+                # Without it the file holds matplotlib's version, and equal reports would differ.
+                figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+                plt.close(figure)
+                pictures[name] = buffer.getvalue()
+    return pictures
+
+
+def assign_colours(labels: Sequence[str]) -> dict[str, str]:
+    """To each method the same colour in every report; variants of a method, and others, take what is left.
+
+    :param labels: of the methods, the reference first
+    :return: label to colour
+    """
+    known = methods()
+    names = [re.split("[=,]", label)[0] for label in labels]
+    colors = {name: known[name].color for name in names if name in known}
+    own = {name: color for name, color in colors.items() if color is not None}
+    spare = itertools.cycle([color for color in PALETTE if color not in own.values()])
+    pairs = zip(labels, names, strict=True)
+    return {label: own.pop(method) if method in own else next(spare) for label, method in pairs}
+
+
+def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
+    import matplotlib.pyplot as plt
+
+    n = len(comparison.groups)
+    figure, axes = plt.subplots(1, n, figsize=(max(6.4, 4.4 * n), 4.2), squeeze=False)
+    for axis, (env_id, methods) in zip(axes[0], comparison.groups.items(), strict=True):
+        # The reference last, so that it lies on top.
+        for label in reversed(methods):
+            rows = [row for row in comparison.curves if (row["env_id"], row["method"]) == (env_id, label)]
+            steps, mean, low, high = (np.array([row[key] for row in rows]) for key in ("steps", "mean", "low", "high"))
+            width = 2.4 if label == comparison.reference else 1.6
+            axis.plot(steps, mean, color=colours[label], lw=width, label=label, marker="o" if len(steps) == 1 else None)
+            axis.fill_between(steps, low, high, color=colours[label], alpha=0.18, lw=0)
+        _show_possible(axis, next(iter(methods.values())))
+        axis.set(title=env_id, xlabel="environment steps")
+        axis.xaxis.set_major_formatter(_short_number)
+        axis.locator_params(axis="x", nbins=5)
+    axes[0, 0].set_ylabel("return")
+    handles = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    # About 0.7 inches for an entry's line and 0.1 for each letter; what does not fit into one row takes several.
+    per_row = int(figure.get_figwidth() / (0.7 + 0.1 * max(map(len, colours))))
+    ncols = max(1, min(per_row, len(colours)))
+    figure.legend([handles[name] for name in colours], list(colours), loc="outside lower center", ncols=ncols)
+    return figure
+
+
+def _show_possible(axis: "Axes", group: Group) -> None:
+    """Cut intervals where returns end: Student's t knows of no bounds."""
+    if group.high == 0:
+        axis.set_ylim(group.low * 1.02, 1)
+
+
+def _short_number(value: float, _: int = 0) -> str:
+    for unit, name in ((1e6, " M"), (1e3, " k")):
+        if abs(value) >= unit:
+            return f"{value / unit:g}{name}"
+    return f"{value:g}"
+
+
+def _thresholds(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+    rows = [row for row in comparison.thresholds if np.isfinite(row["ratio"]) and row["baseline"] in colours]
+    rows = [row for row in rows if row["baseline"] != comparison.reference]
+    if not rows:
+        return None
+    import matplotlib.pyplot as plt
+
+    env_ids = list(dict.fromkeys(row["env_id"] for row in rows))
+    most = max(sum(row["env_id"] == env_id for row in rows) for env_id in env_ids)
+    size = (max(6.4, 4.4 * len(env_ids)), 1.6 + 0.34 * most)
+    figure, axes = plt.subplots(1, len(env_ids), figsize=size, squeeze=False)
+    for axis, env_id in zip(axes[0], env_ids, strict=True):
+        shown = [row for row in rows if row["env_id"] == env_id]
+        for y, row in enumerate(shown):
+            _interval(axis, y, row["ratio"], row["low"], row["high"], colours[row["baseline"]], row["bound"])
+        axis.axvline(1, color=GREY, lw=1)
+        ends = [" (its end)" if row["threshold"] == row["baseline"] else "" for row in shown]
+        names = [
+            f"{row['baseline']}, return {level_text(row['return'])}{end}" for row, end in zip(shown, ends, strict=True)
+        ]
+        axis.set_yticks(range(len(shown)), names)
+        axis.set_xscale("log")
+        axis.set_xlim(*_log_limits([row[key] for row in shown for key in ("ratio", "low", "high")]))
+        axis.set_xticks(
+            [tick for tick in (0.1, 0.2, 0.5, 1, 2, 5, 10) if axis.get_xlim()[0] <= tick <= axis.get_xlim()[1]]
+        )
+        axis.xaxis.set_major_formatter(_short_number)
+        axis.xaxis.set_minor_formatter(lambda value, position: "")
+        axis.set(title=env_id, ylim=(len(shown) - 0.4, -0.6), xlabel=f"steps of {comparison.reference} / steps of it")
+        axis.grid(axis="y", visible=False)
+    return figure
+
+
+def _log_limits(values: Sequence[float]) -> tuple[float, float]:
+    finite = [value for value in values if np.isfinite(value) and value > 0]
+    return min(0.45, 0.85 * min(finite)), max(2.2, 1.15 * max(finite))
+
+
+def _interval(axis: "Axes", y: float, value: float, low: float, high: float, colour: str, bound: str = "") -> None:
+    if np.isfinite(low):
+        axis.plot([low, high], [y, y], color=colour, lw=3, alpha=0.35, solid_capstyle="round")
+    # A hollow mark: a bound, not an estimate.
+    axis.plot([value], [y], "o", color=colour, ms=7, mfc="white" if bound else colour, mew=2)
+
+
+def _splits(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+    rows = [row for row in comparison.final if row["split"] in SPLIT_NAMES and row["mode"] == "deterministic"]
+    if not rows:
+        return None
+    import matplotlib.pyplot as plt
+
+    env_ids = list(dict.fromkeys(row["env_id"] for row in rows))
+    figure, axes = plt.subplots(1, len(env_ids), figsize=(max(6.4, 5.6 * len(env_ids)), 4), squeeze=False)
+    for axis, env_id in zip(axes[0], env_ids, strict=True):
+        labels = [label for label in colours if any((r["env_id"], r["method"]) == (env_id, label) for r in rows)]
+        for i, label in enumerate(labels):
+            found = {r["split"]: r for r in rows if (r["env_id"], r["method"]) == (env_id, label)}
+            x = [list(SPLIT_NAMES).index(split) + 0.7 * ((i + 0.5) / len(labels) - 0.5) for split in found]
+            means, halves = ([r[key] for r in found.values()] for key in ("mean", "half_width"))
+            axis.errorbar(
+                x, means, yerr=np.nan_to_num(halves), fmt="o", ms=7, lw=2.5, color=colours[label], label=label
+            )
+        for line in (0.5, 1.5):
+            axis.axvline(line, color="#e5e7eb", lw=1)
+        axis.set_xticks(range(3), list(SPLIT_NAMES.values()))
+        axis.set(title=env_id, ylabel="return of the final model", xlim=(-0.5, 2.5))
+        _show_possible(axis, comparison.groups[env_id][labels[0]])
+        axis.grid(axis="x", visible=False)
+        axis.legend(loc="best")
+    return figure
+
+
+def _aggregates(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+    titles = {"final": "IQM of the final score", "area": "IQM of the score over all of training"}
+    return _forest(comparison.aggregates, "score", titles, ("method", "iqm"), colours, "normalised return")
+
+
+def _improvement(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+    rows = [{**row, "all": "all"} for row in comparison.improvement]
+    title = {"all": f"Probability that {comparison.reference} ends higher than"}
+    figure = _forest(rows, "all", title, ("baseline", "probability"), colours, "probability")
+    if figure is not None:
+        figure.axes[0].axvline(0.5, color=GREY, lw=1)
+    return figure
+
+
+def _forest(
+    rows: list[Row], panel_key: str, titles: dict[str, str], keys: tuple[str, str], colours: dict[str, str], unit: str
+) -> "Figure | None":
+    """Values with intervals below each other; a panel for each value of ``panel_key``."""
+    if not rows:
+        return None
+    import matplotlib.pyplot as plt
+
+    name, value = keys
+    n = max(sum(row[panel_key] == panel for row in rows) for panel in titles)
+    figure, axes = plt.subplots(1, len(titles), figsize=(5.2 * len(titles), 1.3 + 0.36 * n), squeeze=False)
+    for axis, (panel, title) in zip(axes[0], titles.items(), strict=True):
+        shown = [row for row in rows if row[panel_key] == panel]
+        for y, row in enumerate(shown):
+            _interval(axis, y, row[value], row["low"], row["high"], colours[row[name]])
+        axis.set_yticks(range(len(shown)), [row[name] for row in shown])
+        axis.set(title=title, xlim=(-0.02, 1.02), ylim=(len(shown) - 0.4, -0.6), xlabel=unit)
+        axis.grid(axis="y", visible=False)
+    return figure
+
+
+def _profiles(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+    if not comparison.profiles:
+        return None
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(6.4, 4))
+    for label, colour in reversed(colours.items()):
+        rows = [row for row in comparison.profiles if row["method"] == label]
+        columns: list[Any] = [[row[key] for row in rows] for key in ("score", "share", "low", "high")]
+        axis.plot(columns[0], columns[1], color=colour, lw=2, label=label)
+        axis.fill_between(columns[0], columns[2], columns[3], color=colour, alpha=0.18, lw=0)
+    axis.set(
+        xlabel="normalised return of the final model", ylabel="share of runs above it", xlim=(0, 1), ylim=(-0.02, 1.02)
+    )
+    axis.legend(*(reversed(part) for part in axis.get_legend_handles_labels()), loc="upper right")
+    return figure

@@ -1,0 +1,377 @@
+"""From run folders to the tables of a report."""
+
+import dataclasses
+import itertools
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_abisim.benchmark.report import statistics
+from sb3_abisim.benchmark.report.statistics import Floats
+from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.registry import get_traits
+from sb3_abisim.zoo.runs import Curve, Run, find_runs
+
+# "Final Performance Evaluation", (mean, what stands after +-) of the return; the paper does not say what the latter is.
+PAPER = {
+    "Nav2D-v0": {
+        "abisim": (-14.266, 0.509), "ssi": (-12.613, 1.992), "acro": (-49.436, 0.342), "beta_vae": (-13.880, 2.263),
+        "curl": (-44.791, 7.472), "vanilla": (-14.523, 1.560),
+    },
+    "PointMaze-v0": {
+        "abisim": (-30.8, 3.7), "ssi": (-29.7, 3.9), "acro": (-127.9, 0.61), "beta_vae": (-128.4, 0.52),
+        "curl": (-128.4, 0.45), "vanilla": (-128.4, 0.052),
+    },
+}  # fmt: skip
+PROFILE_TAUS = np.linspace(0.0, 1.0, 101)
+# Shares of the way to the best return, and the return that a method ends with.
+DEFAULT_THRESHOLDS: tuple[float | str, ...] = (0.5, 0.7, 0.9)
+# As a share of the way to the best return: what is reached there says nothing.
+NEAR_THE_LOWEST = 0.05
+DEFAULT_REFERENCE, FROM_SCRATCH = "abisim", "vanilla"
+Row = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """The runs of one method in one environment.
+
+    :param curves: of each run
+    :param finals: of each run, ``<mode>/<split>`` to mean return; empty where no final evaluation was made
+    :param low: return that counts as 0
+    :param high: return that counts as 1
+    """
+
+    env_id: str
+    label: str
+    runs: list[Run]
+    curves: list[Curve]
+    finals: list[dict[str, float]]
+    low: float
+    high: float
+
+    def normalised(self, returns: Any) -> Any:
+        """Returns as shares of the way from ``low`` to ``high``."""
+        return (returns - self.low) / (self.high - self.low)
+
+    def last(self) -> tuple[str, Floats]:
+        """Return of each final model with the most likely action.
+
+        :return: mode and split, ``mode/split``, and the returns; of the last evaluations if a run has no final one, of
+            the end of training if it has none of those either
+        """
+        for name in ("deterministic/eval", "deterministic/standard"):
+            if all(name in final for final in self.finals):
+                return name, np.array([final[name] for final in self.finals])
+        try:
+            return "deterministic/last evaluation", np.array([run.evaluations().returns[-1] for run in self.runs])
+        except ValueError:
+            return "sampled/end of training", np.array([curve.returns[-1] for curve in self.curves])
+
+    def end(self) -> float:
+        """Mean over runs of where their curves end, as :func:`~statistics.steps_to_threshold` measures arrival."""
+        return float(np.mean([curve.returns[-statistics.WINDOW :].mean() for curve in self.curves]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """All that a report says, before it is drawn.
+
+    :param groups: environment to method to its runs; the reference first
+    :param reference: the method that the others are compared with
+    :param source: "evaluations" or "training"
+    :param curves: rows env_id, method, steps, mean, low, high, n_runs
+    :param final: rows env_id, method, mode, split, mean, half_width, n_runs, paper
+    :param thresholds: rows env_id, threshold, return, baseline, ratio, low, high, bound, reached_*, n_*
+    :param aggregates: rows score, method, iqm, low, high
+    :param profiles: rows method, score, share, low, high
+    :param improvement: rows baseline, probability, low, high
+    :param notes: what a reader must know to judge the numbers
+    """
+
+    groups: dict[str, dict[str, Group]]
+    reference: str
+    source: str
+    curves: list[Row]
+    final: list[Row]
+    thresholds: list[Row]
+    aggregates: list[Row]
+    profiles: list[Row]
+    improvement: list[Row]
+    notes: list[str]
+
+
+def compare(
+    folders: Sequence[str],
+    source: str = "evaluations",
+    reference: str | None = None,
+    thresholds: Sequence[float | str] | None = None,
+    seed: int = 0,
+) -> Comparison:
+    """Read runs and compute everything.
+
+    :param folders: each a folder, or ``LABEL=FOLDER`` to call all runs below it LABEL
+    :param source: "evaluations" (the zoo's, during training) or "training" (the training episodes themselves)
+    :param reference: label of the method to compare with the others; None takes abisim, frozen or not, else the first
+    :param thresholds: normalised returns, between 0 and 1, or labels: the mean return that this method ends with; None
+        takes 0.5, 0.7, 0.9 and, where there are such runs, vanilla
+    :param seed: of the bootstrap
+    :raises ValueError: if the runs cannot be compared, with the remedy
+    """
+    if source not in ("evaluations", "training"):
+        raise ValueError(f"source must be 'evaluations' or 'training', got {source!r}")
+    bad = [value for value in thresholds or () if not isinstance(value, str) and not 0 < value <= 1]
+    if bad or (thresholds is not None and not thresholds):
+        raise ValueError(f"thresholds are methods, or normalised returns above 0 and up to 1, got {bad}")
+    runs = _labelled_runs(folders)
+    labels = list(dict.fromkeys(run.label for run in runs))
+    if reference is None:
+        # "abisim" itself, else "abisim,frozen" or "abisim=...".
+        ours = sorted(label for label in labels if re.split("[=,]", label)[0] == DEFAULT_REFERENCE)
+        reference = ours[0] if ours else labels[0]
+    if reference not in labels:
+        raise ValueError(f"no runs of the reference {reference!r} among {', '.join(labels)}; give --reference")
+    if thresholds is None:
+        thresholds = (*DEFAULT_THRESHOLDS, *((FROM_SCRATCH,) if FROM_SCRATCH in labels else ()))
+    unknown = [value for value in thresholds if isinstance(value, str) and value not in labels]
+    if unknown:
+        raise ValueError(f"a threshold is a number or one of {', '.join(labels)}, got {', '.join(unknown)}")
+    notes: list[str] = []
+    groups = _groups(runs, source, reference, notes)
+    labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
+    aggregates, profiles, improvement = _across(groups, labels, reference, seed, notes)
+    return Comparison(
+        groups, reference, source, _curve_rows(groups), _final_rows(groups, notes),
+        _threshold_rows(groups, reference, thresholds, seed, notes), aggregates, profiles, improvement, notes,
+    )  # fmt: skip
+
+
+def _labelled_runs(folders: Sequence[str]) -> list[Run]:
+    runs: list[Run] = []
+    for word in folders:
+        label, folder = split_label(word)
+        if label is not None and label.startswith("_"):
+            raise ValueError(f"Matplotlib hides what is called {label!r}; give a label that does not begin with '_'")
+        found = find_runs(folder)
+        runs += found if label is None else [dataclasses.replace(run, label=label) for run in found]
+    return runs
+
+
+def split_label(word: str) -> tuple[str | None, str]:
+    """The label and the folder of ``LABEL=FOLDER``; both may hold further "=".
+
+    :param word: a folder, or ``LABEL=FOLDER``
+    :return: the label, None for a plain folder, and the folder
+    """
+    places = [] if Path(word).exists() else [place for place, letter in enumerate(word) if letter == "="]
+    for place in places:
+        if Path(word[place + 1 :]).exists():
+            return word[:place], word[place + 1 :]
+    return (word[: places[0]], word[places[0] + 1 :]) if places else (None, word)
+
+
+def _groups(all_runs: list[Run], source: str, reference: str, notes: list[str]) -> dict[str, dict[str, Group]]:
+    found: dict[str, dict[str, list[Run]]] = {}
+    for run in all_runs:
+        found.setdefault(run.env_id, {}).setdefault(run.label, []).append(run)
+    groups: dict[str, dict[str, Group]] = {}
+    order = [env_id for env_id in ENV_IDS if env_id in found] + [env_id for env_id in found if env_id not in ENV_IDS]
+    for env_id in order:
+        runs = [run for method in found[env_id].values() for run in method]
+        curves = {run.folder: run.evaluations() if source == "evaluations" else run.training() for run in runs}
+        for run in runs:
+            _note_unfinished(run, curves[run.folder], notes)
+        low, high = _bounds(env_id, runs, list(curves.values()), notes)
+        groups[env_id] = {}
+        for label in sorted(found[env_id], key=lambda name: name != reference):
+            members = sorted(found[env_id][label], key=lambda run: run.seed)
+            _check_alike(members)
+            finals = [_final_means(run) for run in members]
+            groups[env_id][label] = Group(
+                env_id, label, members, [curves[run.folder] for run in members], finals, low, high
+            )
+        budgets = {label: group.runs[0].n_timesteps for label, group in groups[env_id].items()}
+        if len(set(budgets.values())) > 1:
+            text = ", ".join(f"{label} {budget:,}" for label, budget in budgets.items())
+            notes.append(f"{env_id}: the methods were trained for different numbers of steps ({text}).")
+        if len({len(group.runs) for group in groups[env_id].values()}) > 1:
+            text = ", ".join(f"{label} {len(group.runs)}" for label, group in groups[env_id].items())
+            notes.append(f"{env_id}: the methods have different numbers of runs ({text}).")
+    return groups
+
+
+def _note_unfinished(run: Run, curve: Curve, notes: list[str]) -> None:
+    """A run that was stopped looks like any other, and its method is compared up to its last step."""
+    longest = int(np.diff(curve.steps, prepend=0).max())
+    if curve.steps[-1] + 2 * longest < run.n_timesteps:
+        notes.append(
+            f"{run.env_id}: {run.folder} ends at step {int(curve.steps[-1]):,} of {run.n_timesteps:,}, and no "
+            "run of its method is compared beyond; let it end, or leave it out."
+        )
+
+
+def _check_alike(runs: list[Run]) -> None:
+    """Runs of one method must differ in seeds alone, or their mean says nothing."""
+    hint = "compare them under names of your own: LABEL=FOLDER"
+    label, there = runs[0].label, runs[0].settings
+    for run in runs[1:]:
+        names = sorted(name for name in {**there, **run.settings} if there.get(name) != run.settings.get(name))
+        if names:
+            what = f"{runs[0].folder} and {run.folder} are both {label} but differ in {', '.join(names)}"
+            raise ValueError(f"{what}; {hint}")
+    for first, second in itertools.pairwise(runs):
+        if first.seed == second.seed:
+            raise ValueError(f"{first.folder} and {second.folder} are both {label} with seed {first.seed}; {hint}")
+
+
+def _bounds(env_id: str, runs: list[Run], curves: list[Curve], notes: list[str]) -> tuple[float, float]:
+    """The returns that count as 0 and 1: those of the environment, where they are known."""
+    traits = get_traits(env_id)
+    if traits.return_range is not None and not any(run.env_kwargs.keys() - set(traits.free_kwargs) for run in runs):
+        return traits.return_range
+    low, high = min(float(c.returns.min()) for c in curves), max(float(c.returns.max()) for c in curves)
+    high = high if high > low else low + 1.0
+    notes.append(f"{env_id}: normalised by the lowest and highest mean return of these runs ({low:.1f}, {high:.1f}).")
+    return low, high
+
+
+def _final_means(run: Run) -> dict[str, float]:
+    ending = "/results"
+    final = run.final() or {}
+    return {name.removesuffix(ending): float(array.mean()) for name, array in final.items() if name.endswith(ending)}
+
+
+def _curve_rows(groups: dict[str, dict[str, Group]]) -> list[Row]:
+    rows = []
+    for env_id, methods in groups.items():
+        for label, group in methods.items():
+            steps, returns = statistics.on_common_steps([(curve.steps, curve.returns) for curve in group.curves])
+            mean, half = statistics.mean_and_interval(returns)
+            rows += [
+                {"env_id": env_id, "method": label, "steps": int(step), "mean": m, "low": m - h, "high": m + h,
+                 "n_runs": len(returns)}
+                for step, m, h in zip(steps, mean.tolist(), half.tolist(), strict=True)
+            ]  # fmt: skip
+    return rows
+
+
+def _final_rows(groups: dict[str, dict[str, Group]], notes: list[str]) -> list[Row]:
+    rows = []
+    for env_id, methods in groups.items():
+        for label, group in methods.items():
+            names = sorted(set.intersection(*(set(final) for final in group.finals)))
+            values = {name: np.array([final[name] for final in group.finals]) for name in names}
+            if not values:
+                values = dict([group.last()])
+                notes.append(
+                    f"{env_id}: {label} has no final evaluation; its {next(iter(values)).split('/')[1]} is shown."
+                )
+            for name, returns in values.items():
+                mode, split = name.split("/")
+                mean, half = statistics.mean_and_interval(returns)
+                paper = PAPER.get(env_id, {}).get(label) if mode == "deterministic" else None
+                rows.append(
+                    {"env_id": env_id, "method": label, "mode": mode, "split": split, "mean": float(mean),
+                     "half_width": float(half), "n_runs": len(returns), "paper": paper[0] if paper else None,
+                     "paper_plus_minus": paper[1] if paper else None}
+                )  # fmt: skip
+    return rows
+
+
+def _threshold_rows(
+    groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float | str], seed: int, notes: list[str]
+) -> list[Row]:
+    rows = []
+    for env_id, methods in groups.items():
+        if reference not in methods:
+            continue
+        horizons = {label: int(min(c.steps[-1] for c in group.curves)) for label, group in methods.items()}
+        for threshold in thresholds:
+            if isinstance(threshold, str):
+                if threshold not in methods:
+                    continue
+                level = methods[threshold].end()
+                if methods[threshold].normalised(level) < NEAR_THE_LOWEST:
+                    notes.append(
+                        f"{env_id}: {threshold} ends near the lowest return ({level:.4g}), which takes little to reach."
+                    )
+            else:
+                first = methods[reference]
+                level = first.low + threshold * (first.high - first.low)
+            steps = {
+                label: np.array(
+                    [statistics.steps_to_threshold(c.steps, c.returns, level, horizons[label]) for c in group.curves]
+                )
+                for label, group in methods.items()
+            }
+            for label in methods:
+                if label == reference:
+                    continue
+                pair = horizons[reference], horizons[label]
+                ratio = statistics.steps_ratio(steps[reference], steps[label], pair, seed)
+                rows.append(
+                    {"env_id": env_id, "threshold": threshold, "return": level, "baseline": label,
+                     "ratio": ratio.value, "low": ratio.low, "high": ratio.high, "bound": ratio.bound,
+                     "steps_reference": ratio.steps[0], "steps_baseline": ratio.steps[1],
+                     "reached_reference": int((~np.isnan(steps[reference])).sum()),
+                     "reached_baseline": int((~np.isnan(steps[label])).sum()),
+                     "n_reference": len(steps[reference]), "n_baseline": len(steps[label]),
+                     "horizon_reference": pair[0], "horizon_baseline": pair[1]}
+                )  # fmt: skip
+    return rows
+
+
+def _across(
+    groups: dict[str, dict[str, Group]], labels: list[str], reference: str, seed: int, notes: list[str]
+) -> tuple[list[Row], list[Row], list[Row]]:
+    """IQM, performance profiles and probability of improvement over the environments that all methods have runs in."""
+    shared = [env_id for env_id, methods in groups.items() if set(methods) == set(labels)]
+    counts = {label: min((len(groups[env_id][label].runs) for env_id in shared), default=0) for label in labels}
+    if not shared or min(counts.values()) < 2 or len(labels) < 2:
+        notes.append(
+            "No aggregates across environments: they need two methods or more, an environment that all of them share, "
+            "and two runs of each in it."
+        )
+        return [], [], []
+    if len(shared) < len(groups):
+        notes.append(f"Aggregates are over {', '.join(shared)}: the other environments lack runs of some method.")
+    if any(len(groups[env_id][label].runs) > counts[label] for env_id in shared for label in labels):
+        notes.append("Aggregates take as many runs of a method as it has in each environment, the first ones by seed.")
+    finals, areas = {}, {}
+    for label in labels:
+        members = [groups[env_id][label] for env_id in shared]
+        n = counts[label]
+        finals[label] = np.stack([group.normalised(group.last()[1])[:n] for group in members], axis=1)
+        areas[label] = np.stack(
+            [group.normalised(_areas(group, groups[group.env_id]))[:n] for group in members], axis=1
+        )
+    aggregates = [
+        {"score": name, "method": label, "iqm": value, "low": low, "high": high, "n_runs": counts[label]}
+        for name, scores in (("final", finals), ("area", areas))
+        for label, (value, low, high) in statistics.iqm(scores, seed).items()
+    ]
+    shares, intervals = statistics.performance_profiles(finals, PROFILE_TAUS, seed)
+    profiles = [
+        {"method": label, "score": float(tau), "share": float(shares[label][i]), "low": float(intervals[label][0, i]),
+         "high": float(intervals[label][1, i])}
+        for label in labels for i, tau in enumerate(PROFILE_TAUS)
+    ]  # fmt: skip
+    baselines = {label: finals[label] for label in labels if label != reference}
+    improvement = [
+        {"baseline": label, "probability": value, "low": low, "high": high}
+        for label, (value, low, high) in statistics.probability_of_improvement(
+            finals[reference], baselines, seed
+        ).items()
+    ]
+    return aggregates, profiles, improvement
+
+
+def _areas(group: Group, methods: dict[str, Group]) -> Floats:
+    """Mean return over the course of each run, up to the last step that all methods share."""
+    horizon = min(curve.steps[-1] for other in methods.values() for curve in other.curves)
+    steps, returns = statistics.on_common_steps([(curve.steps, curve.returns) for curve in group.curves])
+    kept = steps <= horizon
+    return statistics.area_under_curve(steps[kept], returns[:, kept])

@@ -1,0 +1,395 @@
+"""Reads datasets: memory-mapped transitions (s_t, a_t, s_{t+k}) that never cross an episode's end.
+
+Nothing that grows with the pictures is loaded; per frame, the reader keeps 5 bytes plus the size of an action. Pages of
+the files that were read count as this process's memory until they are given back, which happens now and then.
+"""
+
+import mmap
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_abisim.common.files import file_digest
+from sb3_abisim.common.spaces import space_from_json
+from sb3_abisim.data.format import (
+    CONFIG_NAME,
+    CUT,
+    INSIDE,
+    META_NAME,
+    DatasetError,
+    array_file,
+    array_layout,
+    check_meta,
+    from_json_file,
+    holds_frames,
+)
+
+# Above this size, opening a dataset compares sizes only; TransitionDataset(path, verify=True) compares hashes too.
+VERIFY_BELOW_BYTES = 4 * 10**9
+# A process may have 256 open on macOS. Of the paper's data at most 157 are used at a time.
+MAX_OPEN_FILES = 200
+# Files whose hash this process has found right: (path, size, time of the last change, sha256).
+_VERIFIED: set[tuple[str, int, int, str]] = set()
+# Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbours with it, so
+# that up to twenty times as much was resident meanwhile. Pages stay in its cache: reading them again is cheap.
+RELEASE_AFTER_BYTES = 16 * 2**20
+# Which segments are held out is a property of the dataset, not of a run.
+_HOLDOUT_SEED = 20240229
+
+Part = Literal["train", "test"]
+# Steps between two observations: a number, or the fewest and the most of them.
+Steps = int | tuple[int, int] | list[int]
+
+
+@dataclass(frozen=True)
+class TransitionBatch:
+    """B transitions in shuffled order.
+
+    :param frames: uint8 [m, C, H, W], in 0..255; those that several transitions share stand once
+    :param actions: a_t, int64 [B] or float32 [B, A]; as sequences a_t to a_{t+k-1}, int64 [B, k] or float32 [B, k, A]
+    :param now: where s_t stands among the frames, int64 [B] or a slice
+    :param later: where s_{t+k} stands among them
+    """
+
+    frames: NDArray[np.uint8]
+    actions: NDArray[Any]
+    now: NDArray[np.int64] | slice
+    later: NDArray[np.int64] | slice
+
+    @property
+    def observations(self) -> NDArray[np.uint8]:
+        """s_t, uint8 [B, C, H, W], in 0..255."""
+        rows: NDArray[np.uint8] = self.frames[self.now]
+        return rows
+
+    @property
+    def next_observations(self) -> NDArray[np.uint8]:
+        """s_{t+k}, uint8 [B, C, H, W]."""
+        rows: NDArray[np.uint8] = self.frames[self.later]
+        return rows
+
+
+class TransitionDataset:
+    """A finished dataset folder, larger than memory if need be.
+
+    A frame index counts the frames of all shards, in order. Pickling (for worker processes) sends the path only.
+
+    :param path: the folder
+    :param holdout: share of the segments (episodes and cut episodes) that make up ``part="test"``, in [0, 1)
+    :param verify: True compares every file with its sha256, False only sizes; None does so once per process for
+        datasets below ``VERIFY_BELOW_BYTES``
+    :raises DatasetError: if the folder is not a finished dataset, or is damaged, or has no frames and the scenes that
+        they would be drawn from are not the same any more
+    """
+
+    def __init__(self, path: str | os.PathLike[str], holdout: float = 0.05, verify: bool | None = None) -> None:
+        if not 0 <= holdout < 1:
+            raise ValueError(f"holdout must be in [0, 1), got {holdout}")
+        self.path = Path(path)
+        self.holdout = holdout
+        self.meta = _read_meta(self.path)
+        self.digest: str = self.meta["digest"]
+        self.env_id: str = self.meta["env_id"]
+        self.env_kwargs: dict[str, Any] = self.meta["env_kwargs"]
+        self.n_transitions: int = self.meta["n_transitions"]
+        self.n_frames: int = self.meta["n_frames"]
+        self.observation_space: spaces.Box = space_from_json(self.meta["observation_space"])  # type: ignore[assignment]
+        self.action_space = space_from_json(self.meta["action_space"])
+        self._check_files(verify)
+        self._draw: Callable[[dict[str, NDArray[Any]]], NDArray[np.uint8]] | None = None
+        if not holds_frames(self.meta):
+            from sb3_abisim.data.rendering import make_drawer
+
+            self._draw = make_drawer(self.path, self.meta)
+        frames_per_shard = [shard["n_frames"] for shard in self.meta["shards"]]
+        # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
+        self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
+        # Open files, the last used ones at the end.
+        self._maps: OrderedDict[tuple[str, int], np.memmap[Any, Any]] = OrderedDict()
+        self._bytes_read = 0
+        n_shards = len(frames_per_shard)
+        self._actions = np.concatenate([self._read("actions", k) for k in range(n_shards)])
+        self._ends = np.concatenate([self._read("ends", k) for k in range(n_shards)])
+        self._last = np.flatnonzero(self._ends != INSIDE)  # the last frame of each segment
+        self._check_ends()
+        self._remaining = self._make_remaining()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.path, self.holdout, False)
+
+    @property
+    def ends(self) -> NDArray[np.uint8]:
+        """Per frame: 0 within a segment, and on its last frame 1 terminated, 2 truncated, 3 cut by a shard's end."""
+        return self._ends.copy()
+
+    def valid_starts(self, k: int = 1, part: Part | None = None) -> NDArray[np.int64]:
+        """The frames t for which frame t + k belongs to the same episode, ascending.
+
+        :param k: steps, at least 1
+        :param part: "test" for the held-out segments, "train" for the others, None for all
+        :raises ValueError: if there is none
+        """
+        if k < 1:
+            raise ValueError(f"k must be at least 1, got {k}")
+        if part not in (None, "train", "test"):
+            raise ValueError(f"part must be 'train', 'test' or None, got {part!r}")
+        longest = int(self._remaining.max())
+        if k > longest:
+            raise ValueError(f"no episode of {self.path} has k = {k} steps, the longest has {longest}; lower k")
+        starts = np.flatnonzero(self._has_steps(k, part))
+        if not len(starts):
+            raise ValueError(
+                f"no transition of {k} steps in part {part!r} of {self.path} ({len(self._last)} segments, holdout "
+                f"{self.holdout}); collect more transitions or use part=None"
+            )
+        return starts
+
+    def _has_steps(self, k: int, part: Part | None) -> NDArray[np.bool_]:
+        """Per frame, whether frame t + k belongs to the same episode, of the part."""
+        valid: NDArray[np.bool_] = self._remaining >= k
+        return valid if part is None else valid & (self._held_out() == (part == "test"))
+
+    def pairs(self, k: Steps = 1, part: Part | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """All pairs of frames (t, t + steps) of the same episode.
+
+        :param k: steps, at least 1, or the fewest and the most of them
+        :param part: see :meth:`valid_starts`
+        :return: t and steps, each int64 [m]
+        :raises ValueError: if there is none
+        """
+        fewest, most = (k, k) if isinstance(k, int) else k
+        if fewest > most:
+            raise ValueError(f"k must be the fewest steps and the most, got {list(k)}")  # type: ignore[arg-type]
+        self.valid_starts(fewest, part)  # raises if there is no pair at all
+        steps = np.arange(fewest, most + 1)
+        starts = [np.flatnonzero(self._has_steps(int(n), part)) for n in steps]
+        return np.concatenate(starts), np.repeat(steps, [len(found) for found in starts])
+
+    def frames(self, index: Any) -> NDArray[np.uint8]:
+        """Frames at the given indices.
+
+        :param index: integers [m] in 0..n_frames - 1
+        :return: uint8 [m, C, H, W], a copy
+        :raises IndexError: for an index out of range
+        """
+        return self._frames(self._check_index(index))
+
+    def actions(self, index: Any) -> NDArray[Any]:
+        """Actions taken at the given frames, int64 [m] or float32 [m, A]; zero at a segment's last frame.
+
+        :param index: integers [m] in 0..n_frames - 1
+        """
+        return self._actions[self._check_index(index)]
+
+    def factors(self, index: Any) -> dict[str, NDArray[Any]]:
+        """The simulator's state behind the given frames: name to [m, ...]; for probes, never for a loss.
+
+        :param index: integers [m] in 0..n_frames - 1
+        """
+        return self._factors(self._check_index(index))
+
+    def batches(
+        self,
+        batch_size: int,
+        k: Steps = 1,
+        seed: int = 0,
+        epoch: int = 0,
+        start: int = 0,
+        part: Part | None = None,
+        sequences: bool = False,
+        run_length: int = 1,
+    ) -> Iterator[TransitionBatch]:
+        """One shuffled pass over all :meth:`pairs`; the last, incomplete batch is dropped.
+
+        The order is a function of (seed, epoch) alone, so that a position in training is two integers.
+
+        With ``run_length`` above 1, runs of transitions that follow each other in an episode are shuffled instead of
+        single ones. A frame then ends one transition and begins the next, so that little more than half as many have to
+        be read and embedded. Where episodes are cut into runs is drawn anew for each pass.
+
+        :param batch_size: transitions per batch
+        :param k: steps between the two observations, or the fewest and the most of them
+        :param seed: of the order
+        :param epoch: which pass
+        :param start: batches to skip
+        :param part: see :meth:`valid_starts`
+        :param sequences: whether actions are all k between the two frames, instead of the first
+        :param run_length: transitions per run, at least 1; with a range of steps, frames that transitions start from
+        :raises ValueError: if there are fewer transitions than one batch takes
+        """
+        if sequences and not isinstance(k, int):
+            raise ValueError(f"sequences of actions need one length, got k = {k}; give one number")
+        for name, value, least in (("batch_size", batch_size, 1), ("run_length", run_length, 1), ("start", start, 0)):
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
+        starts, steps = self.pairs(k, part)
+        if len(starts) < batch_size:
+            raise ValueError(f"batch_size {batch_size} exceeds the {len(starts)} transitions of {k} steps; lower it")
+        # Drawn now and not at the first batch, so that mistakes raise here.
+        generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch])))
+        order = generator.permutation(len(starts)) if run_length == 1 else self._shuffle(starts, run_length, generator)
+        return self._iterate(starts[order], steps[order], batch_size, start, sequences, run_length > 1)
+
+    def _shuffle(self, starts: NDArray[np.int64], run_length: int, generator: np.random.Generator) -> NDArray[np.int64]:
+        """An order of transitions in which those of a run stay together."""
+        lengths = np.diff(self._last, prepend=-1)
+        # Each segment is cut at multiples of run_length, counted from a place before its beginning.
+        before = generator.integers(run_length, size=len(lengths))
+        position = np.arange(self.n_frames) - np.repeat(self._last + 1 - lengths - before, lengths)
+        begins = (position % run_length == 0) | (np.roll(self._ends, 1) != INSIDE)
+        run = np.cumsum(begins)[starts]
+        return np.argsort(generator.permutation(run.max() + 1)[run], kind="stable")
+
+    def _iterate(
+        self,
+        starts: NDArray[np.int64],
+        steps: NDArray[np.int64],
+        batch_size: int,
+        start: int,
+        sequences: bool,
+        shared: bool,
+    ) -> Iterator[TransitionBatch]:
+        for i in range(start, len(starts) // batch_size):
+            here = slice(i * batch_size, (i + 1) * batch_size)
+            index = starts[here]
+            # Both frames of a pair lie close together on disk: one gather reads each page once.
+            both = np.concatenate([index, index + steps[here]])
+            now: Any = slice(None, batch_size)
+            later: Any = slice(batch_size, None)
+            if shared:
+                both, places = np.unique(both, return_inverse=True)
+                now, later = places[now], places[later]
+            taken = index[:, None] + np.arange(steps[0]) if sequences else index
+            yield TransitionBatch(self._frames(both), self._actions[taken], now, later)
+
+    def _check_index(self, index: Any) -> NDArray[np.int64]:
+        array = np.asarray(index)
+        if array.ndim != 1 or (array.dtype.kind not in "iu" and array.size):
+            raise IndexError(f"indices must be one-dimensional integers, got {array.dtype} of shape {array.shape}")
+        bad = array[(array < 0) | (array >= self.n_frames)]
+        if bad.size:
+            raise IndexError(f"frame index {bad[0]} is out of range, the dataset has {self.n_frames} frames")
+        return array.astype(np.int64)
+
+    def _frames(self, index: NDArray[np.int64]) -> NDArray[np.uint8]:
+        return self._gather("frames", index) if self._draw is None else self._draw(self._factors(index))
+
+    def _factors(self, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
+
+    def _gather(self, name: str, index: NDArray[np.int64]) -> NDArray[Any]:
+        dtype, row_shape = array_layout(self.meta, name)
+        out = np.empty((len(index), *row_shape), dtype)
+        order = np.argsort(index)
+        ascending = index[order]
+        bounds = np.searchsorted(ascending, self._offsets)
+        for shard in np.flatnonzero(np.diff(bounds)):
+            here = slice(bounds[shard], bounds[shard + 1])
+            part = self._shard(name, int(shard))[ascending[here] - self._offsets[shard]]
+            out[order[here]] = part
+            self._bytes_read += part.nbytes
+            if self._bytes_read > RELEASE_AFTER_BYTES:
+                self._release_pages()
+        return out
+
+    def _release_pages(self) -> None:
+        self._bytes_read = 0
+        # Not on every platform.
+        if hasattr(mmap, "MADV_DONTNEED"):
+            for array in self._maps.values():
+                array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+
+    def _shard(self, name: str, shard: int) -> NDArray[Any]:
+        """One array of a shard, memory-mapped at its first use."""
+        key = name, shard
+        if key not in self._maps:
+            self._maps[key] = self._read(name, shard, mmap_mode="r")
+            if len(self._maps) > MAX_OPEN_FILES:
+                self._maps.popitem(last=False)
+        self._maps.move_to_end(key)
+        # Indexing a plain array is faster than indexing its memory-mapped subclass.
+        return self._maps[key].view(np.ndarray)
+
+    def _read(self, name: str, shard: int, mmap_mode: Literal["r"] | None = None) -> Any:
+        path = self.path / array_file(name, shard)
+        dtype, row_shape = array_layout(self.meta, name)
+        try:
+            array = np.load(path, mmap_mode=mmap_mode, allow_pickle=False)
+        except ValueError as error:
+            raise DatasetError(f"{path} is not an array file of ours: {error}") from None
+        expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
+        if array.dtype != dtype or array.shape != expected:
+            raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
+        return array
+
+    def _make_remaining(self) -> NDArray[np.int32]:
+        """Steps from each frame to the last of its segment."""
+        lengths = np.diff(self._last, prepend=-1)
+        return (np.repeat(self._last, lengths) - np.arange(self.n_frames)).astype(np.int32)
+
+    def _held_out(self) -> NDArray[np.bool_]:
+        """Per frame, whether its segment belongs to the test part."""
+        n_segments = len(self._last)
+        n_test = min(n_segments - 1, max(1, round(self.holdout * n_segments))) if self.holdout else 0
+        chosen = np.zeros(n_segments, dtype=bool)
+        chosen[np.random.Generator(np.random.PCG64(_HOLDOUT_SEED)).permutation(n_segments)[:n_test]] = True
+        return np.repeat(chosen, np.diff(self._last, prepend=-1))
+
+    def _check_files(self, verify: bool | None) -> None:
+        entries = {name: entry for shard in self.meta["shards"] for name, entry in shard["files"].items()}
+        small = sum(entry["bytes"] for entry in entries.values()) < VERIFY_BELOW_BYTES
+        for name, entry in entries.items():
+            path = self.path / name
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                raise DatasetError(f"{path} is missing; {_repair(self.path, self.meta)}") from None
+            if status.st_size != entry["bytes"]:
+                raise DatasetError(
+                    f"{path} has {status.st_size} bytes instead of {entry['bytes']}; {_repair(self.path, self.meta)}"
+                )
+            key = (str(path.resolve()), status.st_size, status.st_mtime_ns, entry["sha256"])
+            if verify is False or (verify is None and (not small or key in _VERIFIED)):
+                continue
+            if file_digest(path) != entry["sha256"]:
+                raise DatasetError(f"{path} is damaged (sha256 does not match); {_repair(self.path, self.meta)}")
+            _VERIFIED.add(key)
+
+    def _check_ends(self) -> None:
+        shard_ends = self._offsets[1:] - 1
+        fits = self.n_frames == self._offsets[-1] == self.n_transitions + len(self._last)
+        if not fits or self._ends.max() > CUT or (self._ends[shard_ends] == INSIDE).any():
+            raise DatasetError(f"the episode ends of {self.path} contradict its meta.json; it was not written by us")
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    if not path.is_dir():
+        raise DatasetError(f"{path} is not a folder; collect a dataset with sb3-abisim collect")
+    if not (path / META_NAME).exists():
+        if (path / CONFIG_NAME).exists():
+            raise DatasetError(f"{path} is unfinished (no {META_NAME}); run the command that began it again")
+        raise DatasetError(f"{path} is not a dataset (no {META_NAME}); make one with sb3-abisim collect")
+    try:
+        meta = from_json_file(path / META_NAME)
+        check_meta(meta)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        remedy = "run the command that made the dataset again, in a new folder if it refuses"
+        raise DatasetError(f"{path / META_NAME} is damaged or not ours: {error}; {remedy}") from None
+    return meta
+
+
+def _repair(path: Path, meta: dict[str, Any]) -> str:
+    if meta["source"] is not None:
+        return f"remove {path} and import it again from Minari ({meta['source']})"
+    return (
+        "run the command that collected it again, which collects damaged shards anew: sb3-abisim collect "
+        f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} "
+        f"-o {path.absolute()}" + ("" if not meta["env_kwargs"] else " with its --env-kwargs")
+    )

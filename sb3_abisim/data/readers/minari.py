@@ -1,0 +1,320 @@
+"""Lossless exchange with Minari.
+
+Pictures are stored without JPEG. Whatever a Minari dataset says about its environment is only copied as text: nothing
+here makes an environment, because opening one described by a stranger's file can run the stranger's code.
+"""
+
+import hashlib
+import json
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_abisim.common.spaces import is_channels_first, space_from_json, space_to_json
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.format import (
+    CUT,
+    DRAWN_FORMAT_VERSION,
+    FORMAT_VERSION,
+    IDENTITY_KEYS,
+    TERMINATED,
+    TRUNCATED,
+    check_factor_layout,
+    check_spaces,
+)
+from sb3_abisim.data.writer import Segment, check_folder, open_writer
+from sb3_abisim.registry import register_reader
+
+# The key of our block in a Minari dataset's metadata.
+METADATA_KEY = "sb3_abisim"
+# Infos of an exported episode: true on the last row of a segment that ended because its shard did.
+CUT_KEY = "cut_by_shard_end"
+FACTORS_KEY = "factors"
+SHARD_TRANSITIONS = 8192
+SHARD_BYTES = 2**27
+
+
+def export_dataset(folder: str | Path, dataset_id: str) -> None:
+    """Write a dataset into Minari's local store (``MINARI_DATASETS_PATH``).
+
+    Each segment becomes an episode. Rewards are zeros, because a dataset has none; the description says so. A segment
+    cut by a shard's end is marked as truncated, and by ``infos["cut_by_shard_end"]``.
+
+    :param folder: a dataset folder
+    :param dataset_id: such as "nav2d/random-v0"; must be new
+    :raises ValueError: if the folder is no dataset, or the id is malformed or taken
+    :raises ImportError: without Minari, naming the command that installs it
+    """
+    minari = _import_minari()
+    _check_id(dataset_id)
+    dataset = TransitionDataset(folder)
+    source = dataset.meta["source"] or {}
+    channels_last = bool(source.get("channels_last"))
+    space = dataset.observation_space
+    if channels_last:
+        space = _move_channels(space, 0, -1)
+    with warnings.catch_warnings():
+        # Minari warns about each piece of metadata that is left out.
+        warnings.simplefilter("ignore", UserWarning)
+        stored = minari.create_dataset_from_buffers(
+            dataset_id,
+            buffer=[],
+            observation_space=space,
+            action_space=dataset.action_space,
+            algorithm_name=f"{dataset.meta['policy']} policy",
+            description=f"Transitions of {dataset.env_id}, made by sb3_abisim. Rewards were not recorded: all are 0.",
+            # True, the default, stores pictures of 32 x 32 and more as JPEG, which alters them.
+            jpeg_encoding=False,
+        )
+    content = hashlib.sha256()
+    # Without its sum while episodes are missing: a kill leaves a dataset that is not taken for a whole one.
+    ours = {key: dataset.meta[key] for key in IDENTITY_KEYS} | {"rewards_recorded": False, "content_sha256": None}
+    try:
+        stored.storage.update_metadata({METADATA_KEY: ours})
+        stored.storage.update_episodes(_to_episode(s, channels_last) for s in _hashed(_segments(dataset), content))
+        stored.storage.update_metadata({METADATA_KEY: ours | {"content_sha256": content.hexdigest()}})
+    except BaseException:
+        minari.delete_dataset(dataset_id)
+        raise
+
+
+def _check_id(dataset_id: str) -> None:
+    """Minari would make a folder first, and one with a malformed name stops it from listing any dataset."""
+    from minari.dataset.minari_dataset import parse_dataset_id
+
+    try:
+        parse_dataset_id(dataset_id)
+    except (ValueError, TypeError):  # TypeError without a version
+        raise ValueError(f"{dataset_id!r} is no name of a Minari dataset; give one such as nav2d/random-v0") from None
+
+
+def import_dataset(dataset_id: str, folder: str | Path) -> str:
+    """Make a dataset folder from Minari's local store; rewards are dropped.
+
+    Observations must be uint8 pictures (channels first or last) and actions ``Discrete`` or a float32 ``Box``.
+
+    :param dataset_id: of a dataset that is already in the local store
+    :param folder: new or empty
+    :return: the digest of the new dataset
+    :raises ValueError: if there is no such dataset, or it does not fit
+    :raises ImportError: without Minari, naming the command that installs it
+    """
+    _import_minari()
+    folder = Path(folder)
+    check_folder(folder)
+    storage, metadata = _open_storage(dataset_id)
+    identity = _identity(dataset_id, storage, metadata)
+    channels_last = identity["source"]["channels_last"]
+    with open_writer(folder, identity) as writer:
+        if writer.is_finished:
+            raise ValueError(f"{folder} already holds this dataset; name a new folder, or remove it to import it again")
+        n_shards, content = 0, hashlib.sha256()
+        episodes = storage.get_episodes(range(storage.total_episodes))
+        for group in _grouped(_hashed((_segment(e, identity, channels_last) for e in episodes), content)):
+            writer.write_shard(n_shards, group)
+            n_shards += 1
+        if not n_shards:
+            raise ValueError(f"Minari dataset {dataset_id} has no episodes; {_again(dataset_id)}")
+        expected = metadata.get(METADATA_KEY, {}).get("content_sha256", content.hexdigest())
+        if content.hexdigest() != expected:
+            what = (
+                f"Minari dataset {dataset_id} is damaged, was changed since its export or was not exported to its end"
+            )
+            raise ValueError(f"{what}; {_again(dataset_id)}")
+        return writer.finish(n_shards)
+
+
+def _again(dataset_id: str) -> str:
+    return f"remove it with `minari delete {dataset_id}` and export it again"
+
+
+def _import_minari() -> Any:
+    try:
+        import h5py  # noqa: F401
+        import minari
+    except ImportError as error:
+        raise ImportError(f'Minari is not installed ({error}); run: pip install "sb3_abisim[minari]"') from None
+    return minari
+
+
+def _move_channels(space: spaces.Box, origin: int, destination: int) -> spaces.Box:
+    low, high = (np.moveaxis(bound, origin, destination) for bound in (space.low, space.high))
+    return spaces.Box(low, high, dtype=np.uint8)
+
+
+def _segments(dataset: TransitionDataset) -> Iterator[Segment]:
+    ends, first = dataset.ends, 0
+    for last in np.flatnonzero(ends).tolist():
+        index = np.arange(first, last + 1)
+        yield Segment(dataset.frames(index), dataset.actions(index[:-1]), int(ends[last]), dataset.factors(index))
+        first = last + 1
+
+
+def _to_episode(segment: Segment, channels_last: bool) -> Any:
+    from minari.data_collector import EpisodeBuffer
+
+    n = len(segment.actions)
+    at_end = np.arange(n) == n - 1
+    infos: dict[str, Any] = {CUT_KEY: (np.arange(n + 1) == n) & (segment.end == CUT)}
+    if segment.factors:
+        infos[FACTORS_KEY] = segment.factors
+    return EpisodeBuffer(
+        observations=np.moveaxis(np.asarray(segment.frames), 1, -1) if channels_last else segment.frames,
+        actions=segment.actions,
+        rewards=np.zeros(n),
+        terminations=at_end & (segment.end == TERMINATED),
+        truncations=at_end & (segment.end != TERMINATED),
+        infos=infos,
+    )
+
+
+def _hashed(segments: Iterable[Segment], content: Any) -> Iterator[Segment]:
+    """Pass segments on and their content into a hash: HDF5 itself notices no damage."""
+    for segment in segments:
+        for array in (segment.frames, segment.actions, *(segment.factors[name] for name in sorted(segment.factors))):
+            content.update(np.ascontiguousarray(array).data)
+        content.update(bytes([segment.end]))
+        yield segment
+
+
+def _open_storage(dataset_id: str) -> tuple[Any, dict[str, Any]]:
+    """Minari's reader of the arrays, without the parts of Minari that look at the environment."""
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    path = get_dataset_path(dataset_id) / "data"
+    if not path.is_dir():
+        raise ValueError(f"no Minari dataset {dataset_id!r} at {path}; fetch it first: minari download {dataset_id}")
+    metadata = MinariStorage.read_raw_metadata(path)
+    # Where a space is missing, Minari would make the environment to ask it, and with it run what the file names.
+    for key in ("observation_space", "action_space"):
+        if not isinstance(metadata.get(key), str):
+            raise ValueError(f"Minari dataset {dataset_id} does not record its {key}; datasets of Minari 0.5 do")
+    return MinariStorage.read(path), metadata
+
+
+def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[str, Any]:
+    ours = metadata.get(METADATA_KEY)
+    observation_space = storage.observation_space
+    shape = observation_space.shape or ()
+    if not isinstance(observation_space, spaces.Box) or observation_space.dtype != np.uint8 or len(shape) != 3:
+        raise ValueError(
+            f"Minari dataset {dataset_id} has observations {observation_space}; only uint8 pictures can be imported"
+        )
+    channels_last = not is_channels_first(shape)
+    if channels_last:
+        if int(np.argmin(shape)) != 2:
+            raise ValueError(f"observations of shape {shape} are neither channels first nor channels last")
+        observation_space = _move_channels(observation_space, -1, 0)
+    check_spaces(observation_space, storage.action_space)
+    if storage.jpeg_encoding and _is_jpeg(storage.observation_space):
+        warnings.warn(f"Minari dataset {dataset_id} holds JPEG pictures: not what the environment showed", stacklevel=3)
+    source = {"minari": dataset_id, "channels_last": channels_last}
+    identity = {
+        "format_version": FORMAT_VERSION,
+        "observation_space": space_to_json(observation_space),
+        "action_space": space_to_json(storage.action_space),
+        "source": source,
+        "env_id": _recorded_env_id(metadata) or dataset_id,
+        "env_kwargs": {},
+        "factors": {},
+        "fingerprint": None,
+        "policy": "unknown",
+        "seed": None,
+        "n_envs": None,
+        "steps_per_shard": None,
+    }
+    if ours is not None:
+        if (
+            not isinstance(ours, dict)
+            or not set(IDENTITY_KEYS) <= ours.keys()
+            or ours["format_version"] not in (FORMAT_VERSION, DRAWN_FORMAT_VERSION)
+        ):
+            raise ValueError(f"Minari dataset {dataset_id} was exported by another version of sb3_abisim")
+        check_factor_layout(ours["factors"])
+        identity |= {key: ours[key] for key in ("env_id", "env_kwargs", "factors", "fingerprint", "policy", "seed")}
+        source["collected"] = {key: ours[key] for key in ("n_envs", "steps_per_shard")}
+    return identity
+
+
+def _is_jpeg(space: spaces.Box) -> bool:
+    from minari.dataset.minari_storage import is_image_space
+
+    return bool(is_image_space(space))
+
+
+def _recorded_env_id(metadata: dict[str, Any]) -> str | None:
+    """The environment's id as a piece of text; nothing is made from it."""
+    try:
+        return str(json.loads(metadata["env_spec"])["id"])
+    except (KeyError, ValueError, TypeError):
+        return None
+
+
+def _segment(episode: dict[str, Any], identity: dict[str, Any], channels_last: bool) -> Segment:
+    where = f"episode {episode['id']} of Minari dataset {identity['source']['minari']}"
+    observations, terminations, truncations = (
+        np.asarray(episode[key]) for key in ("observations", "terminations", "truncations")
+    )
+    n = len(terminations)
+    if n < 1 or len(observations) != n + 1 or len(truncations) != n or len(episode["actions"]) != n:
+        raise ValueError(
+            f"{where} has {len(observations)} observations, {len(episode['actions'])} actions and {n} terminations; "
+            "n transitions need n + 1 observations"
+        )
+    if (terminations | truncations)[:-1].any():
+        raise ValueError(f"{where} goes on after an end of an episode; split it there first")
+    infos = episode["infos"] or {}
+    if terminations[-1]:
+        end = TERMINATED
+    elif truncations[-1] and not np.any(infos.get(CUT_KEY, False)):
+        end = TRUNCATED
+    else:
+        end = CUT
+    factors = {name: _factor(infos, name, layout, where) for name, layout in identity["factors"].items()}
+    frames = np.moveaxis(observations, -1, 1) if channels_last else observations
+    return Segment(frames, _actions(episode["actions"], identity, where), end, factors)
+
+
+def _factor(infos: dict[str, Any], name: str, layout: dict[str, Any], where: str) -> NDArray[Any]:
+    try:
+        return np.asarray(infos[FACTORS_KEY][name], dtype=layout["dtype"])
+    except (KeyError, TypeError):
+        raise ValueError(f"{where} lacks factor {name!r} that the dataset's metadata announces") from None
+
+
+def _actions(actions: Any, identity: dict[str, Any], where: str) -> NDArray[Any]:
+    space, array = space_from_json(identity["action_space"]), np.asarray(actions)
+    if isinstance(space, spaces.Discrete):
+        array = array.reshape(len(array)) if array.size == len(array) else array
+        low, high = space.start, space.start + space.n - 1
+        fits = array.dtype.kind in "iu" and array.ndim == 1
+    else:
+        low, high = space.low, space.high  # type: ignore[assignment]
+        fits = array.dtype == np.float32 and array.shape[1:] == space.shape
+    if not fits or not ((array >= low) & (array <= high)).all():
+        raise ValueError(f"{where} has actions ({array.dtype}, {array.shape}) that are not in its action space {space}")
+    return array.astype(np.int64) if isinstance(space, spaces.Discrete) else array
+
+
+def _grouped(segments: Iterable[Segment]) -> Iterator[list[Segment]]:
+    """Segments in groups of the size of a shard."""
+    group: list[Segment] = []
+    n_transitions = n_bytes = 0
+    for segment in segments:
+        group.append(segment)
+        n_transitions += len(segment.actions)
+        n_bytes += np.asarray(segment.frames).nbytes
+        if n_transitions >= SHARD_TRANSITIONS or n_bytes >= SHARD_BYTES:
+            yield group
+            group, n_transitions, n_bytes = [], 0, 0
+    if group:
+        yield group
+
+
+register_reader("minari", import_dataset, help="the id of a dataset in Minari's local store")

@@ -1,0 +1,61 @@
+"""Frames of datasets that hold none: drawn from the factors by the environment that was collected in.
+
+A dataset may come from somebody else, so nothing is made by what its files name except an environment of this package,
+through its constructor, with keyword arguments that are JSON values.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.common.spaces import space_to_json
+from sb3_abisim.data.format import DatasetError, describe_factors
+from sb3_abisim.envs.base import BatchEnv, batch_class
+
+
+def make_drawer(path: Path, meta: dict[str, Any]) -> Callable[[dict[str, NDArray[Any]]], NDArray[np.uint8]]:
+    """The function from factors to frames of a dataset.
+
+    :param path: the dataset's folder, for messages
+    :param meta: the content of its meta.json
+    :return: :meth:`~sb3_abisim.envs.base.BatchEnv.draw` of an environment like the one collected in
+    :raises DatasetError: if it is none of ours, cannot be made, or shows something else than at collection
+    """
+    env_id, env_kwargs = meta["env_id"], meta["env_kwargs"]
+    creator = batch_class(env_id)
+    if creator is None:
+        raise DatasetError(
+            f"{path} holds no frames, and {env_id!r}, which would draw them, is not registered here or is no BatchEnv; "
+            "--packages imports what registers it, or ask the dataset's author for one with frames"
+        )
+    spec = gym.spec(env_id)
+    try:
+        env = creator(num_envs=1, **{**spec.kwargs, **env_kwargs})
+    except (TypeError, ValueError, OSError, MemoryError) as error:
+        raise DatasetError(
+            f"{path} holds no frames, and {env_id} with {env_kwargs}, which draws them, cannot be made: {error}; scan "
+            "files must lie where they lay at collection (relative paths start from the folder one is in)"
+        ) from error
+    assert isinstance(env, BatchEnv)
+    if not env.draws_factors:
+        raise DatasetError(f"{path} holds no frames, and {env_id} does not draw any; it was not written by us")
+    here: dict[str, Any] = {
+        "observation_space": space_to_json(env.single_observation_space),
+        "action_space": space_to_json(env.single_action_space),
+        "factors": describe_factors(env.factors()),
+        "fingerprint": getattr(env, "fingerprint", None),
+    }
+    if here["fingerprint"] != meta["fingerprint"]:
+        raise DatasetError(
+            f"the scenes that {path} was collected in have changed (env_kwargs {env_kwargs}: fingerprint "
+            f"{str(meta['fingerprint'])[:16]} at collection, {str(here['fingerprint'])[:16]} now), and its frames are "
+            "drawn from them; bring the same scan files and package version back, or collect again into a new folder"
+        )
+    for key in ("observation_space", "action_space", "factors"):
+        if here[key] != meta[key]:
+            raise DatasetError(f"{path} has {key} {meta[key]}, but {env_id} with {env_kwargs} has {here[key]}")
+    return env.draw

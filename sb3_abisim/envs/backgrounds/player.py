@@ -1,0 +1,103 @@
+"""How environments play clips behind their observations."""
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.envs.backgrounds.clips import Backgrounds
+from sb3_abisim.envs.backgrounds.color_jitter import Looks
+
+ORDERS = ("video", "shuffled")
+# Random numbers used per episode, whatever the clips are.
+N_DRAWS = 3
+
+
+class BackgroundPlayer:
+    """Plays backgrounds behind ``n_envs`` environments: one clip per episode, a random start, one frame per step.
+
+    All randomness comes from the generators given to :meth:`start`, by the same number of draws for any clips: what an
+    environment draws afterwards is the same in every split.
+
+    :param backgrounds: the clips
+    :param n_envs: number of environments
+    :param order: "video", or "shuffled" for each clip's frames in a random order of the episode's own, which takes
+        away the correlation between neighbouring frames
+    :param recolour: whether each episode shows its clip in a look of its own (:class:`~sb3_abisim.envs.backgrounds.color_jitter.Looks`)
+    :raises ValueError: for an unknown order
+    """
+
+    def __init__(self, backgrounds: Backgrounds, n_envs: int, order: str = "video", recolour: bool = False) -> None:
+        if order not in ORDERS:
+            raise ValueError(f"order must be one of {ORDERS}, got {order!r}")
+        self.backgrounds = backgrounds
+        self.clip = np.zeros(n_envs, dtype=np.int64)
+        self._position = np.zeros(n_envs, dtype=np.int64)
+        self._shuffles: list[NDArray[np.int64]] | None = None
+        if order == "shuffled":
+            self._shuffles = [np.zeros(1, dtype=np.int64)] * n_envs
+        self._looks = Looks(n_envs) if recolour else None
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the clips; another one where they are shown in other looks."""
+        plain = self.backgrounds.fingerprint
+        return plain if self._looks is None else hashlib.sha256(f"{plain} in looks".encode()).hexdigest()
+
+    def start(self, index: int, generator: np.random.Generator) -> None:
+        """Begin a new episode of environment ``index``.
+
+        :param index: of the environment
+        :param generator: three numbers are drawn from it
+        """
+        clip_draw, start_draw, own_draw = generator.random(N_DRAWS).tolist()
+        clip = int(clip_draw * self.backgrounds.n_clips)
+        length = int(self.backgrounds.lengths[clip])
+        self.clip[index] = clip
+        self._position[index] = int(start_draw * length)
+        own = np.random.default_rng(int(own_draw * 2**53))
+        if self._shuffles is not None:
+            self._shuffles[index] = own.permutation(length)
+        if self._looks is not None:
+            self._looks.draw(index, own)
+
+    def advance(self) -> None:
+        """Go on by one frame in every environment."""
+        self._position += 1
+
+    @property
+    def frame(self) -> NDArray[np.int64]:
+        """Index of the frame now shown, within its clip, shape (n_envs,)."""
+        frame = self.backgrounds.fold(self.clip, self._position)
+        if self._shuffles is not None:
+            rows = zip(self._shuffles, frame.tolist(), strict=True)
+            frame = np.array([shuffle[position] for shuffle, position in rows], dtype=np.int64)
+        return frame
+
+    def pictures(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """What is now shown behind the environments ``indices``: a new array, uint8 (len(indices), 3, 64, 64).
+
+        :param indices: of environments, shape (m,)
+        """
+        # Positions that are not shuffled need no folding here, `frames` does it.
+        frame = self._position if self._shuffles is None else self.frame
+        pictures = self.backgrounds.frames(self.clip[indices], frame[indices])
+        return pictures if self._looks is None else self._looks.apply(pictures, indices)
+
+
+def composite(
+    pictures: NDArray[np.uint8], masks: NDArray[np.bool_], backgrounds: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """Lay pictures over backgrounds; foreground pixels keep their bytes.
+
+    :param pictures: uint8 (m, 3, 64, 64)
+    :param masks: (m, 64, 64), true where a picture's pixel belongs to the foreground
+    :param backgrounds: uint8 (m, 3, 64, 64), overwritten
+    :return: ``backgrounds``
+    """
+    # Bytes of 0 at the foreground and 255 elsewhere, so that bitwise operations choose, faster than a masked copy.
+    behind = (masks.view(np.uint8) - np.uint8(1))[:, None]
+    np.bitwise_xor(backgrounds, pictures, out=backgrounds)
+    np.bitwise_and(backgrounds, behind, out=backgrounds)
+    np.bitwise_xor(backgrounds, pictures, out=backgrounds)
+    return backgrounds

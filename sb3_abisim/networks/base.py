@@ -1,0 +1,142 @@
+"""Encoders: networks from image observations to embeddings, built by name.
+
+An encoder takes what Stable-Baselines3 hands to a features extractor: float images in 0..1, channels first.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import torch as th
+from torch import nn
+
+from sb3_abisim.registry import get_network, networks
+
+
+class Encoder(nn.Module):
+    """A network from images to an embedding, rebuilt from :meth:`spec` alone.
+
+    Its weights lie in memory with channels last, and so do the activations that torch makes with them: on a CPU the
+    layout in which small convolutions are fastest.
+
+    :param layers: module from float images (batch, channels, height, width) in 0..1 to (batch, features_dim)
+    :param features_dim: size of the embedding
+    :param name: of the network in the registry
+    :param network_kwargs: keyword arguments of its factory, JSON types only
+    :param input_shape: (channels, height, width) of the observations
+    """
+
+    def __init__(
+        self,
+        layers: nn.Module,
+        features_dim: int,
+        name: str,
+        network_kwargs: dict[str, Any],
+        input_shape: tuple[int, ...],
+    ) -> None:
+        super().__init__()
+        self.layers = layers
+        self.features_dim = features_dim
+        self.input_shape = input_shape
+        self._name, self._network_kwargs = name, network_kwargs
+        self.offset: th.Tensor
+        self.scale: th.Tensor
+        self.register_buffer("offset", th.zeros(features_dim))
+        self.register_buffer("scale", th.ones(()))
+        self._lay_out(th.channels_last)
+
+    def _lay_out(self, memory_format: th.memory_format) -> None:
+        self.to(memory_format=memory_format)  # type: ignore[call-overload]
+
+    def apply(self, fn: Callable[[nn.Module], None]) -> "Encoder":
+        """As in torch, whose ``orthogonal_`` (which SB3 initializes with) takes no weights with channels last.
+
+        :param fn: called on every submodule
+        """
+        self._lay_out(th.contiguous_format)
+        super().apply(fn)
+        self._lay_out(th.channels_last)
+        return self
+
+    def spec(self) -> dict[str, Any]:
+        """The architecture as JSON: ``make_encoder(space, spec["name"], **spec["kwargs"])`` builds it again."""
+        return {"name": self._name, "kwargs": dict(self._network_kwargs)}
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Embed images.
+
+        :param observations: float (batch, channels, height, width) in 0..1
+        :return: float (batch, features_dim)
+        """
+        features: th.Tensor = self.layers(observations)
+        return (features - self.offset) * self.scale
+
+    @th.no_grad()
+    def standardize(self, observations: th.Tensor) -> None:
+        """Shift and scale the embedding so that its numbers have mean 0 and, on average, variance 1.
+
+        One factor for all of them: distances between embeddings keep their ratios. Pretraining leaves the scale
+        arbitrary (an L1 penalty makes it small, since the head can undo that), but the networks that RL puts on top
+        start from weights made for inputs of variance 1.
+
+        :param observations: float (batch, channels, height, width) in 0..1, many enough for a mean
+        :raises ValueError: if the embedding is the same for all of them
+        """
+        # In parts: the first layers' activations are many times as large as the embedding.
+        embeddings = th.cat([self(part) for part in th.split(observations, 256)])
+        variance = embeddings.var(dim=0, correction=0).mean()
+        if not float(variance) > 0:
+            raise ValueError("the embedding is the same for all observations: nothing was learned, or it has collapsed")
+        self.offset += embeddings.mean(dim=0) / self.scale
+        self.scale /= variance.sqrt()
+
+
+def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **kwargs: Any) -> Encoder:
+    """Build an encoder for an observation space.
+
+    :param observation_space: a channels-first image space
+    :param name: of a registered network; None takes the one that is the default for the space's shape
+    :param kwargs: keyword arguments of its factory
+    :raises ValueError: for an unknown name or keyword, or a space that the network does not fit
+    """
+    shape = observation_space.shape
+    if name is None:
+        defaults = {key: network.observation_shape for key, network in networks().items() if network.observation_shape}
+        fitting = [key for key, observation_shape in defaults.items() if observation_shape == shape]
+        if not fitting:
+            known = ", ".join(f"{key} {observation_shape}" for key, observation_shape in defaults.items())
+            raise ValueError(
+                f"no default network for observations of shape {shape}; known are: {known}. Name a network, or "
+                "register one of your own with sb3_abisim.register_network"
+            )
+        name = fitting[0]
+    network = get_network(name)
+    try:
+        module = network.factory(observation_space, **kwargs)
+    except TypeError as error:
+        raise ValueError(f"{name} does not take these arguments: {error}") from error
+    if not isinstance(module, Encoder):
+        assert shape is not None
+        module = Encoder(module, _features_dim(name, module, shape), name, kwargs, shape)
+    # SB3 turns observations into float32, whatever torch's default is.
+    encoder: Encoder = module.float()
+    if shape != encoder.input_shape:
+        raise ValueError(f"{name} takes observations of shape {encoder.input_shape}, got {shape}")
+    return encoder
+
+
+def _features_dim(name: str, module: nn.Module, shape: tuple[int, ...]) -> int:
+    """Size of a module's output, found out by a forward pass that changes nothing in it."""
+    tensor = next(iter((*module.parameters(), *module.buffers())), th.zeros(()))
+    mode = module.training
+    try:
+        with th.no_grad(), th.random.fork_rng(devices=[]):
+            output = module.eval()(th.zeros((1, *shape), device=tensor.device, dtype=tensor.dtype))
+    except RuntimeError as error:
+        raise ValueError(f"the network {name} does not take observations of shape {shape}: {error}") from error
+    finally:
+        module.train(mode)
+    if not isinstance(output, th.Tensor) or output.dim() != 2:
+        what = tuple(output.shape) if isinstance(output, th.Tensor) else type(output).__name__
+        raise ValueError(f"the network {name} must give a tensor (batch, features_dim), got {what}; end it in Flatten")
+    return int(output.shape[1])

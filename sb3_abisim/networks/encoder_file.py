@@ -1,0 +1,345 @@
+"""The encoder file: pretrained weights and everything needed to refuse a wrong use of them.
+
+One safetensors file. Its tensors are the weights (``encoder.*``), the golden batch (``golden.observations``, uint8
+frames, and ``golden.embeddings``, what the network made of them when it was saved) and ``digest``. Its metadata hold
+one JSON text: format, network and contract. (One text, because safetensors writes several in random order.) The digest
+is the sha256 of the file with the digest's own 32 bytes set to zero, so any changed bit is noticed at load. It protects
+against damage, not against forgery; a forged file still runs no code, since the network is looked up in our own table.
+"""
+
+import copy
+import hashlib
+import json
+import os
+import re
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import safetensors.torch
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+
+from sb3_abisim._version import __version__
+from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.paths import resource_path
+from sb3_abisim.common.spaces import space_to_json
+from sb3_abisim.networks.base import Encoder, make_encoder
+
+FORMAT = 1
+# The embeddings of the golden batch may differ by this fraction of the largest one (other machine, other torch).
+GOLDEN_TOLERANCE = 1e-4
+MAX_FILE_BYTES = 1 << 30
+HUB_PREFIX = "hf://"
+# A zoo run on a frozen encoder keeps a copy of its file under this name, in its folder <env id> beside config.yml.
+RUN_COPY = "encoder.safetensors"
+
+_METADATA_KEY = "sb3_abisim"
+_CONTRACT_KEYS = {
+    "observation_space",
+    "action_space",
+    "env_id",
+    "env_kwargs",
+    "objective",
+    "settings",
+    "dataset_digest",
+    "versions",
+}
+_DIGEST_BYTES = 32
+_WEIGHT_PREFIX = "encoder."
+_REMEDY = "copy it again from where it came from, or write it again with sb3-abisim pretrain"
+
+
+class EncoderFileError(ValueError):
+    """The file is damaged or is not an encoder file; the message names the path and the remedy."""
+
+
+class EncoderNotFoundError(FileNotFoundError):
+    """No encoder file of that name; the message lists the places searched."""
+
+
+@dataclass(frozen=True)
+class EncoderFile:
+    """A verified encoder file.
+
+    :param path: where it was read
+    :param digest: sha256 in hexadecimal of its content
+    :param encoder: the network with its weights, on the CPU, in evaluation mode
+    :param contract: observation_space, action_space, env_id, env_kwargs, objective, settings, dataset_digest, versions
+    """
+
+    path: Path
+    digest: str
+    encoder: Encoder
+    contract: dict[str, Any]
+
+    def check(self, observation_space: gym.Space[Any], action_space: gym.Space[Any] | None = None) -> None:
+        """Refuse spaces other than those of pretraining.
+
+        :param observation_space: the space of the observations to embed
+        :param action_space: None leaves it unchecked (an extractor does not know it)
+        :raises ValueError: with both sides
+        """
+        sides = {"observation_space": _describe(observation_space)}
+        if action_space is not None:
+            sides["action_space"] = space_to_json(action_space)
+        for kind, here in sides.items():
+            if here != self.contract[kind]:
+                raise ValueError(
+                    f"{self.path} was pretrained on {self.contract['env_id']} with {kind} {self.contract[kind]}, "
+                    f"but is to be used with {here}; use an encoder pretrained for this environment"
+                )
+
+
+def save_encoder(
+    path: str | os.PathLike[str],
+    encoder: Encoder,
+    *,
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    objective: str,
+    settings: dict[str, Any],
+    dataset_digest: str,
+    golden_observations: NDArray[np.uint8],
+) -> str:
+    """Write an encoder file; the same arguments and package versions give the same bytes.
+
+    :param path: the file; its folder must exist
+    :param encoder: the trained network, on any device; it is left as it was
+    :param observation_space: of the environment: uint8 images in 0..255, channels first
+    :param action_space: of the environment, ``Discrete`` or ``Box``
+    :param env_id: id of the environment that the data came from
+    :param env_kwargs: its keyword arguments, JSON types
+    :param objective: short name of the objective, e.g. "ssi"
+    :param settings: hyperparameters of the pretraining, JSON types
+    :param dataset_digest: digest of the dataset
+    :param golden_observations: a few frames, uint8 (n, channels, height, width)
+    :return: digest of the content, sha256 in hexadecimal
+    :raises ValueError: for weights that are not finite, values that JSON cannot hold, frames that do not fit
+    """
+    shape = observation_space.shape
+    if not is_image_space(observation_space) or shape is None:
+        raise ValueError(f"observation_space must be uint8 images in 0..255, channels first, got {observation_space}")
+    golden = th.from_numpy(np.array(golden_observations, order="C"))
+    if golden.dtype != th.uint8 or tuple(golden.shape[1:]) != shape or len(golden) == 0:
+        raise ValueError(f"golden_observations must be uint8 (n, *{shape}), got {golden.dtype} {tuple(golden.shape)}")
+    document = {
+        "format": FORMAT,
+        "network": encoder.spec(),
+        "contract": {
+            "observation_space": _describe(observation_space),
+            "action_space": space_to_json(action_space),
+            "env_id": env_id,
+            "env_kwargs": env_kwargs,
+            "objective": objective,
+            "settings": settings,
+            "dataset_digest": dataset_digest,
+            "versions": _versions(),
+        },
+    }
+    try:
+        text = json.dumps(document, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"env_kwargs and settings must be JSON values ({error}): {env_kwargs}, {settings}") from error
+    on_cpu = copy.deepcopy(encoder).cpu().eval()
+    tensors = {_WEIGHT_PREFIX + name: value.contiguous() for name, value in on_cpu.state_dict().items()}
+    broken = [name for name, value in tensors.items() if not bool(th.isfinite(value).all())]
+    if broken:
+        raise ValueError(f"weights are not finite, the encoder is not saved: {broken}")
+    tensors["golden.observations"] = golden
+    tensors["golden.embeddings"] = embed(on_cpu, observation_space, golden)
+    data, digest = _serialize(tensors, text)
+    write_atomic(path, lambda file: file.write(data))
+    return digest
+
+
+def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
+    """Read and verify an encoder file.
+
+    :param name: as for :func:`resolve_encoder`
+    :return: the encoder with its contract
+    :raises EncoderNotFoundError: when there is no such file
+    :raises EncoderFileError: when a bit has changed, the file is something else, or its golden batch does not agree
+    """
+    path = resolve_encoder(name)
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise EncoderFileError(
+            f"{path} has {path.stat().st_size} bytes, more than {MAX_FILE_BYTES}; not an encoder file"
+        )
+    data = path.read_bytes()
+    header = _header(path, data)
+    digest = _verify_digest(path, data, header)
+    try:
+        document = json.loads(header["__metadata__"][_METADATA_KEY])
+        found = document["format"]
+        if found != FORMAT:
+            raise EncoderFileError(
+                f"{path} has format {found!r}, this version reads {FORMAT}; install a newer sb3_abisim"
+            )
+        tensors = safetensors.torch.load(data)
+        contract = document["contract"]
+        if set(contract) != _CONTRACT_KEYS:
+            raise ValueError(f"contract has the keys {sorted(contract)}, expected {sorted(_CONTRACT_KEYS)}")
+        golden, expected = tensors.pop("golden.observations"), tensors.pop("golden.embeddings")
+        if golden.dtype != th.uint8 or list(golden.shape[1:]) != contract["observation_space"]["shape"]:
+            raise ValueError(f"golden batch {tuple(golden.shape)} is not of {contract['observation_space']}")
+        space = spaces.Box(0, 255, tuple(golden.shape[1:]), np.uint8)
+        encoder = _build(space, document["network"], tensors)
+    except EncoderFileError:
+        raise
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:
+        raise EncoderFileError(f"{path} is not a valid encoder file ({error!r}); {_REMEDY}") from error
+    _check_golden(path, embed(encoder, space, golden), expected)
+    return EncoderFile(path, digest, encoder, contract)
+
+
+def embed(encoder: Encoder, space: gym.Space[Any], frames: th.Tensor) -> th.Tensor:
+    """Embed uint8 frames through the preprocessing that SB3 puts before a features extractor, without gradients.
+
+    :param encoder: the network, on the device of the frames
+    :param space: the space of one frame
+    :param frames: uint8 (batch, channels, height, width)
+    :return: float32 (batch, features_dim)
+    """
+    observations = preprocess_obs(frames, space)
+    assert isinstance(observations, th.Tensor)
+    with th.no_grad():
+        embeddings: th.Tensor = encoder(observations)
+        return embeddings.float().contiguous()
+
+
+def resolve_encoder(name: str | os.PathLike[str]) -> Path:
+    """Find an encoder file.
+
+    :param name: a path; else the name of an encoder that comes with the package, such as
+        "DistractorPointMaze-v0/abisim"; or ``hf://owner/repository/file.safetensors``, downloaded from the Hugging Face
+        Hub (``hf://owner/repository@revision/file.safetensors`` for a fixed revision)
+    :raises EncoderNotFoundError: listing the places searched
+    """
+    text = os.fspath(name)
+    if not text:
+        raise ValueError("encoder must be a path, the name of a shipped encoder or hf://owner/repository/file, got ''")
+    if text.startswith(HUB_PREFIX):
+        return _download(text)
+    folder = resource_path("encoders")
+    candidates = [Path(text).expanduser().absolute(), folder / text, folder / f"{text}.safetensors"]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    searched = ", ".join(str(candidate) for candidate in dict.fromkeys(candidates))
+    shipped = sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.safetensors"))
+    raise EncoderNotFoundError(
+        f"no encoder file {text!r}; searched {searched}. Shipped encoders: {', '.join(shipped) or 'none'}. "
+        f"Correct the name, or write the file with sb3-abisim pretrain"
+    )
+
+
+def _describe(observation_space: gym.Space[Any]) -> dict[str, Any]:
+    return {**space_to_json(observation_space), "channel_order": "CHW"}
+
+
+def _versions() -> dict[str, str]:
+    packages = ("torch", "stable_baselines3", "gymnasium", "safetensors", "numpy")
+    return {"sb3_abisim": __version__, **{package: version(package) for package in packages}}
+
+
+def _serialize(tensors: dict[str, th.Tensor], text: str) -> tuple[bytes, str]:
+    blank = safetensors.torch.save(
+        {**tensors, "digest": th.zeros(_DIGEST_BYTES, dtype=th.uint8)}, {_METADATA_KEY: text}
+    )
+    header_size = int.from_bytes(blank[:8], "little")
+    start = 8 + header_size + json.loads(blank[8 : 8 + header_size])["digest"]["data_offsets"][0]
+    digest = hashlib.sha256(blank)
+    return blank[:start] + digest.digest() + blank[start + _DIGEST_BYTES :], digest.hexdigest()
+
+
+def _header(path: Path, data: bytes) -> dict[str, Any]:
+    """The JSON header of a safetensors file, read before the library sees the data."""
+    end = 8 + int.from_bytes(data[:8], "little")
+    try:
+        if not 8 < end <= len(data):
+            raise ValueError("no header of a safetensors file, or cut short")
+        header = json.loads(data[8:end])
+        if not isinstance(header, dict):
+            raise ValueError("the header is not a JSON object")
+    except (ValueError, RecursionError) as error:
+        kind = "damaged or not an encoder file"
+        if data.startswith(b"PK"):
+            kind = "a zip archive (a saved SB3 model, or a torch file), not an encoder file"
+        elif data.startswith(b"\x80"):
+            kind = "a pickle, which is never read, not an encoder file"
+        raise EncoderFileError(f"{path} is {kind} ({error}); {_REMEDY}") from error
+    return header
+
+
+def _verify_digest(path: Path, data: bytes, header: dict[str, Any]) -> str:
+    try:
+        entry = header["digest"]
+        start, stop = entry["data_offsets"]
+        start, stop = (8 + int.from_bytes(data[:8], "little") + int(offset) for offset in (start, stop))
+        stored = data[start:stop]
+        if entry["dtype"] != "U8" or len(stored) != _DIGEST_BYTES:
+            raise ValueError("digest field has another size")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise EncoderFileError(f"{path} has no valid digest: not an encoder file, or damaged; {_REMEDY}") from error
+    actual = hashlib.sha256(data[:start] + bytes(_DIGEST_BYTES) + data[stop:])
+    if actual.digest() != stored:
+        raise EncoderFileError(
+            f"{path} is damaged: its content has sha256 {actual.hexdigest()}, not {stored.hex()} as it was written; "
+            f"{_REMEDY}"
+        )
+    return actual.hexdigest()
+
+
+def _build(space: spaces.Box, network: dict[str, Any], tensors: dict[str, th.Tensor]) -> Encoder:
+    name, kwargs = network["name"], network["kwargs"]
+    if not isinstance(name, str) or not isinstance(kwargs, dict):
+        raise ValueError(f"network must be a name with keyword arguments, got {network}")
+    weights = {key.removeprefix(_WEIGHT_PREFIX): tensors[key] for key in tensors if key.startswith(_WEIGHT_PREFIX)}
+    # First without memory: constructor arguments from a damaged or hostile file could ask for terabytes.
+    with th.device("meta"):
+        blueprint = make_encoder(space, name, **kwargs)
+    promised = {key: (tuple(value.shape), value.dtype) for key, value in blueprint.state_dict().items()}
+    stored = {key: (tuple(value.shape), value.dtype) for key, value in weights.items()}
+    if promised != stored:
+        raise ValueError(f"weights {stored} do not fit the network {name} with {kwargs}, which has {promised}")
+    # The weights drawn here are overwritten at once; the caller's random numbers must not depend on that.
+    with th.random.fork_rng(devices=[]):
+        encoder = make_encoder(space, name, **kwargs)
+    encoder.load_state_dict(weights)
+    return encoder.eval()
+
+
+def _check_golden(path: Path, actual: th.Tensor, expected: th.Tensor) -> None:
+    if actual.shape != expected.shape or expected.dtype != th.float32:
+        raise EncoderFileError(f"{path}: golden embeddings have shape {tuple(expected.shape)}; {_REMEDY}")
+    error, scale = float((actual - expected).abs().max()), float(expected.abs().max())
+    # Written so that NaN fails as well.
+    if not error <= GOLDEN_TOLERANCE * scale + 1e-6:
+        raise EncoderFileError(
+            f"{path}: the network embeds the golden batch differently than when it was saved (largest difference "
+            f"{error:.3g}, embeddings up to {scale:.3g}); install the versions named in its contract, or pretrain again"
+        )
+
+
+def _download(name: str) -> Path:
+    match = re.fullmatch(r"hf://([^/@]+/[^/@]+)(?:@([^/]+))?/(.+)", name)
+    if match is None:
+        raise ValueError(f"a Hub name looks like hf://owner/repository/file.safetensors, got {name!r}")
+    repository, revision, filename = match.groups()
+    try:
+        from huggingface_hub import hf_hub_download
+    except ImportError as error:
+        raise EncoderNotFoundError(f"{name} needs the Hub client: pip install huggingface_hub") from error
+    try:
+        return Path(hf_hub_download(repository, filename, revision=revision))
+    except (OSError, ValueError) as error:
+        raise EncoderNotFoundError(f"{name} could not be downloaded: {error}") from error

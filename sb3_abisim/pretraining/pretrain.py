@@ -1,0 +1,184 @@
+"""Pretrain an encoder on a dataset: the only training loop, and its command.
+
+``sb3-abisim pretrain --objective abisim --env Nav2D-v0 --data DIR -o FILE``
+
+A run is a function of its settings and the data. While it lasts, ``<FILE without ending>.run/`` holds its checkpoints
+and logs; the same command goes on from the last checkpoint and ends in the same bytes as an uninterrupted run (on the
+same machine type, package versions, device type and thread count).
+"""
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sb3_abisim.common.cli import make_parser, parse_pairs, run
+from sb3_abisim.pretraining.config import PretrainConfig, load_config
+from sb3_abisim.registry import get_method, get_objective
+
+if TYPE_CHECKING:
+    from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.pretraining.trainer import Callback
+
+
+def pretrain(
+    objective: str,
+    data: str | Path,
+    output: str | Path,
+    config: PretrainConfig | None = None,
+    base: str | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    progress_bar: bool = True,
+    verbose: int = 1,
+    callback: "Callback | None" = None,
+) -> Path:
+    """Train an encoder and write its file and card; go on where an interrupted call with the same arguments stopped.
+
+    :param objective: name of a method that has one, such as "ssi"
+    :param data: folder written by :mod:`sb3_abisim.data.collect`
+    :param output: the encoder file, ending in ``.safetensors``; the card is ``.json`` beside it
+    :param config: settings; None takes ours for the dataset's environment
+    :param base: for an objective that builds on another method's encoder, as "abisim" does on "ssi", its file or name;
+        None pretrains it on the same data first, into ``<output without ending>.base.safetensors``
+    :param seed: of weights and batches
+    :param device: "auto", "cpu", "cuda", ...
+    :param progress_bar: show one
+    :param verbose: 1 prints the log's rows
+    :param callback: takes the encoder in evaluation mode at every row of the log and returns further numbers for it, by
+        name; the encoder file does not depend on it
+    :return: the encoder file
+    :raises ValueError: if the output belongs to other settings, or anything does not fit together
+    :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
+    """
+    from sb3_abisim.common.files import folder_lock, remove_temporaries
+    from sb3_abisim.common.malloc import keep_freed_memory
+    from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.networks.base import make_encoder
+    from sb3_abisim.pretraining.trainer import PretrainRun, make_objective
+
+    get_objective(objective)
+    base_method = get_method(objective).base
+    if seed < 0:
+        raise ValueError(f"seed must be at least 0, got {seed}")
+    keep_freed_memory()
+    output = Path(output)
+    if output.suffix != ".safetensors":
+        raise ValueError(f"the output must end in .safetensors, got {output}")
+    _check_place_of_card(output.with_suffix(".json"))
+    env_id = read_env_id(Path(data))
+    config = config or load_config(objective, env_id)
+    dataset = TransitionDataset(data, holdout=config.holdout)
+    _check_parts(dataset, config)
+    if base_method is not None and base is None:
+        base = str(output.with_name(f"{output.stem}.base.safetensors"))
+        # Mistakes in its own settings are found before the base is trained.
+        stand_in = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
+        make_objective(objective, dataset, config, stand_in)
+        # Of the same network and data, whatever this one is asked to have.
+        base_config = load_config(base_method, env_id)
+        base_config = dataclasses.replace(
+            base_config, network=config.network, network_kwargs=config.network_kwargs, holdout=config.holdout,
+            batch_size=min(base_config.batch_size, config.batch_size),
+        )  # fmt: skip
+        pretrain(base_method, data, base, base_config, None, seed, device, progress_bar, verbose)
+    if base_method is None and base is not None:
+        raise ValueError(f"{objective!r} builds on no base encoder, got base={base!r}; leave it out")
+    folder = output.with_suffix(".run")
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with folder_lock(folder):
+            remove_temporaries(folder)
+            run = PretrainRun(objective, dataset, output, config, base, seed, device, callback)
+            if run.is_finished():
+                run.drop_checkpoints()
+                if verbose:
+                    print(f"{output} is finished already; nothing to do")
+                return output
+            run.train(progress_bar, verbose)
+    finally:
+        # What was refused at once leaves no empty folder behind.
+        if not any(folder.iterdir()):
+            folder.rmdir()
+    return output
+
+
+def _check_parts(dataset: "TransitionDataset", config: PretrainConfig) -> None:
+    n = len(dataset.pairs(config.k, "train")[0])
+    if n < config.batch_size:
+        raise ValueError(
+            f"{dataset.path} has {n} transitions to train on, too few for a batch of {config.batch_size}; collect more "
+            "or set a smaller batch_size"
+        )
+    if config.holdout:
+        try:
+            dataset.pairs(config.k, "test")
+        except ValueError as error:
+            what = f"no segment held out of {dataset.path} (holdout {config.holdout}) has a transition of k steps"
+            raise ValueError(f"{what}; collect more transitions, or set holdout:0") from error
+
+
+def _check_place_of_card(path: Path) -> None:
+    """The card's name follows from the encoder's, and may be that of a file which is somebody's own."""
+    if path.exists():
+        try:
+            is_card = "curves" in json.loads(path.read_bytes())
+        except (OSError, ValueError, TypeError):
+            is_card = False
+        if not is_card:
+            raise ValueError(f"the encoder's card would replace {path}, which is none; name another output")
+
+
+def read_env_id(data: Path) -> str:
+    """The environment id of a finished dataset, without opening the rest of it.
+
+    :param data: the dataset's folder
+    :raises ValueError: if the folder holds none
+    """
+    meta_path = data / "meta.json"
+    if not meta_path.is_file():
+        raise ValueError(f"{data} holds no finished dataset (no meta.json); run sb3_abisim.data.collect first")
+    try:
+        return str(json.loads(meta_path.read_bytes())["env_id"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{meta_path} was not written by sb3_abisim.data.collect ({error!r}); give its folder"
+        ) from error
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command; see ``--help``.
+
+    :param argv: its words; the program's arguments by default
+    """
+    parser = make_parser(
+        "pretrain",
+        "Pretrain an encoder on a dataset. Killed at any moment, the same command goes on from its last checkpoint.",
+        "pretrain --objective abisim --data data/pointmaze -o my/abisim.safetensors",
+    )
+    parser.add_argument("--objective", required=True, metavar="METHOD", help="such as ssi or abisim")
+    parser.add_argument("--env", metavar="ID", help="refuse data of another environment than this")
+    parser.add_argument("--data", required=True, metavar="DIR", help="a dataset's folder")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="encoder file (.safetensors)")
+    parser.add_argument(
+        "--base", metavar="FILE", help="base encoder, for a method that builds on one (default: pretrain it first)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default: %(default)s)")
+    parser.add_argument("--device", default="auto", help="as in Stable-Baselines3 (default: %(default)s)")
+    parser.add_argument(
+        "-params", "--params", nargs="+", action="extend", default=[], metavar="NAME:VALUE",
+        help="replace settings, such as n_updates:1000 objective_kwargs.c:0.9",
+    )  # fmt: skip
+    parser.add_argument("--verbose", type=int, default=1, choices=(0, 1), help="1 prints the log (default: 1)")
+    run(parser, argv, _command, "interrupted; the same command goes on from the last checkpoint")
+
+
+def _command(args: argparse.Namespace) -> None:
+    data = Path(args.data)
+    env_id = read_env_id(data)
+    if args.env is not None and env_id != args.env:
+        raise ValueError(f"{data} was collected in {env_id}, not in {args.env}")
+    config = load_config(args.objective, env_id, parse_pairs(args.params, "-params"))
+    pretrain(args.objective, data, args.output, config, args.base, args.seed, args.device, verbose=args.verbose)

@@ -1,0 +1,60 @@
+"""What an RL run says about its encoder."""
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import unwrap_vec_wrapper
+
+from sb3_abisim.common.malloc import keep_freed_memory
+from sb3_abisim.rl.checks import find_extractors, require_weights
+from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
+
+
+class EncoderCallback(BaseCallback):
+    """States the encoders when training starts, refuses to train without their weights, and logs their drift.
+
+    Also states the fingerprint of the clips or scans that the training environment shows, if it has one, and lets torch
+    reuse memory (:mod:`sb3_abisim.common.malloc`). Logs
+    ``encoder/drift`` at the end of each rollout: how far the weights have moved from those that training started with,
+    relative to the norm of the latter (the largest value, where actor and critic have encoders of their own).
+
+    :param verbose: as in Stable-Baselines3
+    :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
+    :raises ValueError: when training starts, if the model was trained on the embeddings of another encoder
+    """
+
+    def _on_training_start(self) -> None:
+        keep_freed_memory()
+        require_weights(self.model)
+        self._extractors = [extractor for _, extractor in find_extractors(self.model.policy)]
+        for name, extractor in find_extractors(self.model.policy):
+            origin = f"digest {extractor.digest}" if extractor.digest else "random weights"
+            state = "frozen" if extractor.frozen else "trained along"
+            print(
+                f"Encoder {name}: {type(extractor).__name__}, source {extractor.source}, {origin}, "
+                f"{extractor.n_parameters} parameters, {state}"
+            )
+        encoding = unwrap_vec_wrapper(self.training_env, VecEncodeObservations)
+        if encoding is not None:
+            # VecNormalize.load brings the space of the saved run, and Stable-Baselines3 compares the model's with that.
+            space = self.model.observation_space
+            # Of another kind where embeddings of several steps are stacked, which Stable-Baselines3 compares itself.
+            if isinstance(space, EncodedBox) and space != encoding.observation_space:
+                raise ValueError(
+                    f"the model was trained on {space}, but {encoding.source} makes {encoding.observation_space}; give "
+                    "the encoder file that it was trained on"
+                )
+            print(
+                f"Encoder of the environment: {type(encoding).__name__}, source {encoding.source}, "
+                f"digest {encoding.encoder_file.digest}, {encoding.n_parameters} parameters, frozen"
+            )
+        elif not self._extractors:
+            print("Encoder: none of sb3_abisim's, policy_kwargs names another features extractor")
+        if self.training_env.has_attr("fingerprint"):
+            (fingerprint,) = self.training_env.get_attr("fingerprint", indices=0)
+            print(f"Pictures of the training environment: {fingerprint}")
+
+    def _on_rollout_end(self) -> None:
+        if self._extractors:
+            self.logger.record("encoder/drift", max(extractor.drift() for extractor in self._extractors))
+
+    def _on_step(self) -> bool:
+        return True

@@ -1,0 +1,324 @@
+"""Features extractors for Stable-Baselines3: a pretrained encoder behind ``features_extractor_class``.
+
+What SB3 does to any extractor with its default settings, and where that is stopped here:
+
+* ``ortho_init`` draws the weights of every submodule anew: :meth:`PretrainedExtractor.apply`.
+* ``set_training_mode(True)`` wakes batch norm: :meth:`PretrainedExtractor.train`.
+* Target networks are averaged over ``parameters()``, which rounds even where both sides are equal, and optimizers with
+  weight decay move what has no gradient: frozen weights are buffers, not parameters.
+* ``load`` builds the extractor before it restores the weights: without its file it is built empty, and
+  ``weights_ready`` says whether weights have come since.
+"""
+
+import functools
+import json
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
+from sb3_abisim.registry import Method, get_method, methods
+from sb3_abisim.rl.optimizers import mark_encoder
+
+
+class EncoderExtractor(BaseFeaturesExtractor):
+    """Hands an encoder's embedding, as it is, to the policy. Base of all extractors here.
+
+    :param observation_space: uint8 images in 0..255, channels first (SB3 transposes the others by itself)
+    :param encoder: the network
+    """
+
+    # The weights that training started from, flat, float32; a buffer, so that it is saved with the model.
+    initial_weights: th.Tensor
+
+    source: str
+    frozen: bool = False
+
+    def __init__(self, observation_space: gym.Space[Any], encoder: Encoder) -> None:
+        super().__init__(observation_space, encoder.features_dim)
+        self.encoder = encoder
+        mark_encoder(encoder)
+        self._weight_names = [name for name, _ in encoder.named_parameters()]
+        self.register_buffer("initial_weights", self._flat_weights().clone())
+        self._input_checked = False
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)  # type: ignore[no-untyped-call]
+        # Copies of parameters lose it.
+        mark_encoder(self.encoder)
+
+    @property
+    def digest(self) -> str | None:
+        """sha256 (hexadecimal) of the encoder file that the weights came from, None if they came from none."""
+        return None
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of weights, whether frozen or not."""
+        return self.initial_weights.numel()
+
+    def drift(self) -> float:
+        """Distance of the weights from those training started with, relative to the norm of the latter."""
+        with th.no_grad():
+            distance = th.linalg.vector_norm(self._flat_weights() - self.initial_weights)
+            return float(distance / th.linalg.vector_norm(self.initial_weights))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """Embed observations.
+
+        :param observations: float (batch, channels, height, width) in 0..1, as SB3 preprocesses images
+        :return: the encoder's embedding, float (batch, features_dim)
+        :raises ValueError: if the first pictures that arrive are not in 0..1
+        """
+        if not self._input_checked:
+            self._check_input(observations)
+        features: th.Tensor = self.encoder(observations)
+        return features
+
+    def _check_input(self, observations: th.Tensor) -> None:
+        largest = float(observations.max()) if observations.numel() else 0.0
+        if largest > 1.0:
+            raise ValueError(
+                f"observations reach {largest:g}, but encoders take images in 0..1; "
+                "remove normalize_images=False from policy_kwargs"
+            )
+        # A black picture proves nothing.
+        self._input_checked = largest > 0.0
+
+    def _flat_weights(self) -> th.Tensor:
+        weights = self.encoder.state_dict()
+        return th.cat([weights[name].flatten().float() for name in self._weight_names])
+
+
+class VanillaExtractor(EncoderExtractor):
+    """The network without pretraining, the baseline. SB3 initialises and trains it like its own extractors.
+
+    :param observation_space: uint8 images in 0..255, channels first
+    :param network: name of the network; None takes the one made for the observation's shape
+    :param network_kwargs: its keyword arguments
+    :raises ValueError: for an observation space that is not of images or does not fit the network
+    """
+
+    source = "untrained"
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        network: str | None = None,
+        network_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        _check_space(observation_space)
+        super().__init__(observation_space, make_encoder(observation_space, network, **(network_kwargs or {})))
+
+    def apply(self, fn: Any) -> "VanillaExtractor":
+        """As in torch; afterwards drift is measured from the new weights (SB3 initialises through this method).
+
+        :param fn: called on every submodule
+        """
+        super().apply(fn)
+        self.initial_weights.copy_(self._flat_weights())
+        return self
+
+
+class PretrainedExtractor(EncoderExtractor):
+    """An encoder from a file. Subclasses name the objective that must have trained it.
+
+    The network follows from ``observation_space``, ``network`` and ``network_kwargs`` alone, never from the file, so
+    that a saved model can be rebuilt where the file is absent; a file with another network is refused.
+
+    :param observation_space: uint8 images in 0..255, channels first; equal to that of pretraining
+    :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
+        ``hf://owner/repository/file.safetensors``. If there is none, ``forward`` raises until weights are restored by
+        ``load`` or ``set_parameters``
+    :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
+    :param network: name of the network; None takes the one made for the observation's shape
+    :param network_kwargs: its keyword arguments
+    :raises ValueError: for a damaged file, or one of another objective, other observations or another network
+    """
+
+    objective: ClassVar[str]
+
+    # 1 once the weights come from an encoder file, directly or through a saved model.
+    weights_ready: th.Tensor
+    encoder_digest: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        encoder: str,
+        freeze: bool = False,
+        network: str | None = None,
+        network_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        _check_space(observation_space)
+        file: EncoderFile | None = None
+        absence = ""
+        try:
+            file = load_encoder(encoder)
+        except EncoderNotFoundError as error:
+            absence = str(error)
+        if file is not None:
+            check_objective(file, self.objective)
+            file.check(observation_space)
+        module = _build_network(observation_space, network, network_kwargs or {}, file)
+        super().__init__(observation_space, module)
+        self.source = encoder
+        self.frozen = freeze
+        self.contract = None if file is None else file.contract
+        self._absence = absence
+        digest = bytes(32) if file is None else bytes.fromhex(file.digest)
+        self.register_buffer("weights_ready", th.tensor(file is not None, dtype=th.uint8))
+        self.register_buffer("encoder_digest", th.tensor(list(digest), dtype=th.uint8))
+        if freeze:
+            _parameters_to_buffers(self.encoder)
+            self.encoder.eval()
+
+    @property
+    def digest(self) -> str | None:
+        """sha256 (hexadecimal) of the encoder file that the weights came from, None while there are no weights."""
+        return bytes(self.encoder_digest.tolist()).hex() if bool(self.weights_ready) else None
+
+    def require_weights(self) -> None:
+        """Raise if the encoder file was absent and no saved model has brought the weights since.
+
+        :raises EncoderNotFoundError: (a ``FileNotFoundError``) listing the places searched
+        """
+        if not bool(self.weights_ready):
+            raise EncoderNotFoundError(f"{self._absence}. The extractor has no pretrained weights")
+
+    def apply(self, fn: Any) -> "PretrainedExtractor":
+        """Do nothing: SB3's ``ortho_init=True`` would overwrite the pretrained weights through this method.
+
+        :param fn: not called
+        """
+        return self
+
+    def train(self, mode: bool = True) -> "PretrainedExtractor":
+        """Switch between training and evaluation; a frozen encoder stays in evaluation mode.
+
+        :param mode: True for training
+        """
+        super().train(mode)
+        if self.frozen:
+            self.encoder.eval()
+        return self
+
+    def _check_input(self, observations: th.Tensor) -> None:
+        self.require_weights()
+        super()._check_input(observations)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_from_state_dict(*args, **kwargs)
+        # The loaded model may be one that never had its weights.
+        self._input_checked = False
+
+
+def extractor_class(method: str) -> type[EncoderExtractor]:
+    """The features extractor of a method, the same object at every call.
+
+    :param method: a registered name, e.g. "ssi"
+    :raises ValueError: for an unknown one
+    """
+    return _class_of(get_method(method))
+
+
+def method_of(extractor: type[EncoderExtractor]) -> str | None:
+    """The name of the method whose features extractor a class is; None for one that belongs to none.
+
+    :param extractor: the class
+    """
+    return next((name for name, method in methods().items() if method.extractor == extractor.__name__), None)
+
+
+def __getattr__(name: str) -> Any:
+    # The classes of methods, also for pickle, which finds a class by its module and name.
+    for method in methods().values():
+        if method.extractor == name:
+            return _class_of(method)
+    known = ", ".join(method.extractor for method in methods().values())
+    raise AttributeError(
+        f"no method has a features extractor {name!r}; known are {known}. Import the package that registers it first "
+        "(--packages)"
+    )
+
+
+@functools.cache
+def _class_of(method: Method) -> type[EncoderExtractor]:
+    if not method.is_pretrained:
+        parents, attributes, what = (VanillaExtractor,), {}, f"{method.label}: the network without pretraining"
+    else:
+        parents, attributes = (PretrainedExtractor,), {"objective": method.name}  # type: ignore[assignment]
+        what = f"Encoder pretrained by {method.label}"
+    doc = f"{what}; parameters as for :class:`{parents[0].__name__}`."
+    if method.extractor == parents[0].__name__:
+        return parents[0]
+    return type(method.extractor, parents, {**attributes, "__module__": __name__, "__doc__": doc})
+
+
+def _check_space(observation_space: gym.Space[Any]) -> None:
+    if isinstance(observation_space, spaces.Dict):
+        raise ValueError(
+            f"an encoder takes one image, got {observation_space}; build it on one key inside an extractor of your own "
+            "for MultiInputPolicy"
+        )
+    if not is_image_space(observation_space):
+        raise ValueError(
+            f"an encoder takes uint8 images in 0..255, got {observation_space}; leave images unnormalised "
+            "(VecNormalize(norm_obs=False), in a zoo YAML no `normalize: true`), SB3 divides them by 255"
+        )
+
+
+def check_objective(file: EncoderFile, objective: str) -> None:
+    """Refuse an encoder that another objective has trained.
+
+    :param file: the encoder file
+    :param objective: short name of the objective that is expected, e.g. "ssi"
+    :raises ValueError: with both sides
+    """
+    trained_by = file.contract["objective"]
+    if trained_by != objective:
+        known = methods()
+        remedy = (
+            f"use {known[trained_by].extractor}"
+            if trained_by in known
+            else f"known methods are {', '.join(known)} (--packages imports what registers others)"
+        )
+        raise ValueError(f"{file.path} was trained by {trained_by!r}, not {objective!r}; {remedy}")
+
+
+def _build_network(
+    observation_space: gym.Space[Any], network: str | None, network_kwargs: dict[str, Any], file: EncoderFile | None
+) -> Encoder:
+    """The network that the arguments describe, with the file's weights if there is a file."""
+    if file is None:
+        return make_encoder(observation_space, network, **network_kwargs)
+    stored = _json_spec(file.encoder)
+    hint = f"pass network={stored['name']!r}, network_kwargs={stored['kwargs']} to the extractor"
+    try:
+        encoder = make_encoder(observation_space, network, **network_kwargs)
+    except ValueError as error:
+        raise ValueError(f"{error}; to use {file.path}, {hint}") from error
+    if _json_spec(encoder) != stored:
+        raise ValueError(f"{file.path} holds the network {stored}, the extractor builds {_json_spec(encoder)}; {hint}")
+    encoder.load_state_dict(file.encoder.state_dict())
+    return encoder
+
+
+def _json_spec(encoder: Encoder) -> dict[str, Any]:
+    """The spec as a file gives it back (lists for tuples)."""
+    spec: dict[str, Any] = json.loads(json.dumps(encoder.spec()))
+    return spec
+
+
+def _parameters_to_buffers(module: nn.Module) -> None:
+    """Turn parameters into buffers: the same state dict, out of reach of whatever updates parameters."""
+    for submodule in module.modules():
+        for name, parameter in list(submodule.named_parameters(recurse=False)):
+            delattr(submodule, name)
+            submodule.register_buffer(name, parameter.detach().clone())

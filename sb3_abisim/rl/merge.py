@@ -1,0 +1,115 @@
+"""From a model trained on embeddings (``VecEncodeObservations``) to the equal one that acts on pictures."""
+
+import argparse
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
+
+from sb3_abisim.common.cli import make_parser, run
+from sb3_abisim.common.spaces import space_from_json
+from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
+from sb3_abisim.rl.extractors import extractor_class
+from sb3_abisim.rl.vec_encode import EncodedBox
+
+AlgorithmT = TypeVar("AlgorithmT", bound=BaseAlgorithm)
+
+
+def merge_encoder(model: AlgorithmT, encoder: str) -> AlgorithmT:
+    """Put the encoder into a model that was trained on its embeddings.
+
+    The result has the same heads on a frozen features extractor, as if it had been trained through the pixels; it acts
+    the same and can be trained further. Saved, it is complete: it loads where the encoder file is absent.
+
+    :param model: of any pixel algorithm, trained on ``VecEncodeObservations``; it is left as it was. A loaded one
+        does not know whether its environment normalised observations: only a model that has it is remerged for that
+    :param encoder: the encoder file that it was trained on, as for ``VecEncodeObservations``
+    :return: a model of the same class without an environment, on the same device
+    :raises FileNotFoundError: if there is no such encoder
+    :raises ValueError: for a model that was trained on something else
+    """
+    file = load_encoder(encoder)
+    if not isinstance(model.observation_space, EncodedBox):
+        raise ValueError(
+            f"the model was trained on {model.observation_space}, not on the embeddings of an encoder; "
+            "wrap its environment in VecEncodeObservations and train it with MlpPolicy"
+        )
+    if model.observation_space.digest != file.digest:
+        raise ValueError(
+            f"the model was trained on the embeddings of the encoder with digest {model.observation_space.digest}, "
+            f"but {file.path} has {file.digest}; give the file that it was trained on"
+        )
+    normalize = model.get_vec_normalize_env()
+    if normalize is not None and normalize.norm_obs:
+        raise ValueError("the model was trained on normalised embeddings; train it with VecNormalize(norm_obs=False)")
+    network = file.encoder.spec()
+    # Through the format of a saved model, which knows what belongs to one.
+    buffer = io.BytesIO()
+    model.save(buffer)
+    data: Any
+    params: Any
+    data, params, variables = load_from_zip_file(buffer, device=model.device)
+    data["observation_space"] = space_from_json(file.contract["observation_space"])
+    data["policy_kwargs"] |= {
+        "features_extractor_class": extractor_class(file.contract["objective"]),
+        "features_extractor_kwargs": {
+            "encoder": encoder,
+            "freeze": True,
+            "network": network["name"],
+            "network_kwargs": network["kwargs"],
+        },
+    }
+    data["_last_obs"] = data["_last_original_obs"] = None
+    # As SB3's load does it, except that the features extractor has its weights from the file.
+    merged = type(model)(data["policy_class"], None, device=model.device, _init_setup_model=False)  # type: ignore[call-arg]
+    merged.__dict__.update(data)
+    merged._setup_model()
+    params["policy"] = merged.policy.state_dict() | params["policy"]
+    merged.set_parameters(params, exact_match=True, device=model.device)
+    for name, value in (variables or {}).items():
+        recursive_setattr(merged, f"{name}.data", value.data)
+    if merged.use_sde:
+        merged.policy.reset_noise()  # type: ignore[operator]
+    return merged
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command; see ``--help``.
+
+    :param argv: the program's arguments by default
+    """
+    parser = make_parser(
+        "merge",
+        "Put a frozen encoder into the model that was trained on its embeddings; the result acts on observations.",
+        "merge --algo ppo logs/ppo/PointMaze-v0_1/PointMaze-v0.zip -o agent.zip",
+    )
+    parser.add_argument("model", type=Path, metavar="MODEL", help="zip of a model trained on an encoder's embeddings")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="zip to write")
+    parser.add_argument("--algo", required=True, help="its algorithm, by rl-zoo3's name, such as ppo")
+    parser.add_argument("-e", "--encoder", metavar="FILE", help="encoder (default: the copy in the run's folder)")
+    run(parser, argv, _command)
+
+
+def _command(args: argparse.Namespace) -> None:
+    from rl_zoo3 import ALGOS
+
+    if args.algo not in ALGOS:
+        raise ValueError(f"unknown algorithm {args.algo!r}; rl-zoo3 knows {', '.join(sorted(ALGOS))}")
+    if not args.model.is_file():
+        raise ValueError(f"there is no model {args.model}; give the zip in the folder of a run that has ended")
+    encoder = args.encoder
+    if encoder is None:
+        copies = sorted(args.model.parent.glob(f"*/{RUN_COPY}"))
+        if len(copies) != 1:
+            raise ValueError(f"{args.model.parent} holds {len(copies)} encoder files */{RUN_COPY}; give --encoder")
+        encoder = str(copies[0])
+    # As Stable-Baselines3 does.
+    output = args.output if args.output.suffix else args.output.with_suffix(".zip")
+    try:
+        merge_encoder(ALGOS[args.algo].load(args.model, device="cpu"), encoder).save(output)
+    except OSError as error:
+        raise ValueError(f"cannot merge {args.model}: {error}") from error
+    print(f"Wrote {output}, a model that acts on observations")

@@ -1,0 +1,115 @@
+"""A vectorised environment that shows a frozen encoder's embeddings instead of pictures.
+
+With ``freeze=True`` a features extractor embeds each picture again in every epoch and every update. Here each is
+embedded once, when the environment shows it, and rollouts, replay buffers and updates hold the embeddings.
+``merge_encoder`` afterwards makes the trained model into one that acts on pictures.
+"""
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.utils import get_device
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.encoder_file import embed, load_encoder
+from sb3_abisim.rl.extractors import check_objective
+
+
+class EncodedBox(spaces.Box):
+    """The space of the embeddings by one encoder: float32 (features_dim,), unbounded.
+
+    Two are equal only if the encoder is the same, so that Stable-Baselines3 refuses to go on with a saved model on the
+    embeddings of another one.
+
+    :param features_dim: size of the embedding
+    :param digest: sha256 (hexadecimal) of the encoder file
+    """
+
+    def __init__(self, features_dim: int, digest: str) -> None:
+        super().__init__(-np.inf, np.inf, (features_dim,), np.float32)
+        self.digest = digest
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, EncodedBox) and self.digest == other.digest and super().__eq__(other)
+
+    def __repr__(self) -> str:
+        return f"EncodedBox({self.shape[0]}, digest={self.digest!r})"
+
+
+class VecEncodeObservations(VecEnvWrapper):
+    """Embeds every observation by a frozen encoder, those at the ends of episodes included.
+
+    Put it under ``VecNormalize`` (which may scale rewards, ``norm_obs=False``); use it with ``MlpPolicy``. In a zoo
+    YAML::
+
+        vec_env_wrapper:
+          - sb3_abisim.VecEncodeObservations:
+              encoder: Nav2D-v0/abisim
+
+    :param venv: shows uint8 images in 0..255, channels first, as the encoder saw in pretraining
+        (``VecTransposeImage`` makes them so)
+    :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
+        ``hf://owner/repository/file.safetensors``
+    :param objective: refuse an encoder that another objective has trained; None takes any
+    :param device: where to run the encoder, as in Stable-Baselines3
+    :raises FileNotFoundError: if there is no such encoder
+    :raises ValueError: for a damaged file, or one of another objective or other observations
+    """
+
+    observation_space: EncodedBox
+
+    def __init__(
+        self, venv: VecEnv, encoder: str, objective: str | None = None, device: th.device | str = "auto"
+    ) -> None:
+        file = load_encoder(encoder)
+        if objective is not None:
+            check_objective(file, objective)
+        file.check(venv.observation_space)
+        super().__init__(venv, observation_space=EncodedBox(file.encoder.features_dim, file.digest))
+        self.encoder_file = file
+        self.source = encoder
+        self._device = get_device(device)
+        self._encoder: Encoder = file.encoder.to(self._device).requires_grad_(False)
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of the encoder's weights."""
+        return sum(parameter.numel() for parameter in self._encoder.parameters())
+
+    def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Embed pictures.
+
+        :param frames: uint8 (batch, channels, height, width)
+        :return: float32 (batch, features_dim)
+        """
+        tensor = th.from_numpy(frames).to(self._device)
+        embeddings: NDArray[np.float32] = embed(self._encoder, self.venv.observation_space, tensor).cpu().numpy()
+        return embeddings
+
+    def reset(self) -> NDArray[np.float32]:
+        """Start all episodes anew.
+
+        :return: float32 (n_envs, features_dim)
+        """
+        frames = self.venv.reset()
+        assert isinstance(frames, np.ndarray)
+        return self.encode(frames)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Wait for the step that ``step_async`` began.
+
+        :return: as from any ``VecEnv``, with embeddings for observations and for each ``terminal_observation``
+        """
+        frames, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(frames, np.ndarray)
+        ended = [info for info in infos if "terminal_observation" in info]
+        if ended:
+            # One forward for all: the terminal pictures go behind the n_envs current ones.
+            frames = np.concatenate([frames, np.stack([info["terminal_observation"] for info in ended])])
+        embeddings = self.encode(frames)
+        for info, embedding in zip(ended, embeddings[self.num_envs :], strict=True):
+            info["terminal_observation"] = embedding
+        return embeddings[: self.num_envs], rewards, dones, infos

@@ -1,0 +1,251 @@
+"""rl-zoo3's experiment manager with our hyperparameters, methods and evaluation splits.
+
+For the environments in ``hyperparams/*.yml`` of this package:
+
+* without ``--conf-file``, the hyperparameters are those of this package;
+* evaluation of environments with splits (moving backgrounds) is on the evaluation split, unless ``--eval-env-kwargs``
+  gives another one.
+
+For every environment:
+
+* ``--conf-file METHOD[=ENCODER][,frozen]`` keeps the hyperparameters and replaces the features extractor; frozen, it
+  puts ``VecEncodeObservations`` in its place;
+* copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
+* a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
+* ``-optimize`` keeps a features extractor of this package, which rl-zoo3 alone would drop (rl-zoo3#431).
+"""
+
+import copy
+import functools
+import importlib
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rl_zoo3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_abisim.envs.base import batch_class
+from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
+from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
+from sb3_abisim.registry import get_traits
+from sb3_abisim.rl.checks import check_trained_with
+from sb3_abisim.rl.extractors import EncoderExtractor, method_of
+from sb3_abisim.zoo.methods import (
+    PREPROCESSING_KEYS,
+    MethodRecord,
+    MethodSpec,
+    encoding_kwargs,
+    hyperparameters_entry,
+    hyperparameters_file,
+    normalizes_observations,
+    resolve_classes,
+    zoo_hyperparams,
+)
+
+rl_utils: Any = importlib.import_module("rl_zoo3.utils")
+exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
+if not hasattr(exp_manager, "ExperimentManager"):
+    # We run inside the import of that module, through its import of custom_envs. Importing it afresh completes it now,
+    # and the outer import returns what sys.modules holds in the end.
+    del sys.modules["rl_zoo3.exp_manager"]
+    exp_manager = importlib.import_module("rl_zoo3.exp_manager")
+
+
+class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[misc]
+    """``rl_zoo3.exp_manager.ExperimentManager`` that knows methods; parameters as there."""
+
+    algo: str
+    config: str
+    custom_hyperparams: dict[str, Any] | None
+    env_kwargs: dict[str, Any]
+    eval_env_kwargs: dict[str, Any]
+    vec_env_class: type
+    _hyperparams: dict[str, Any]
+    _spec: MethodSpec | None
+    # Whether a run of this process has begun to learn: errors before that are mistakes of the command.
+    has_begun = False
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As rl-zoo3 does, from our files and with a method's values.
+
+        :return: the hyperparameters, and a sorted copy to save
+        :raises ValueError: for an unknown method, or hyperparameters that do not fit together
+        """
+        env_id = self.env_name.gym_id
+        is_default = Path(self.config).parent == zoo_hyperparams()
+        self._spec = None if is_default else MethodSpec.of_conf_file(self.config)
+        if is_default or self._spec is not None:
+            ours = hyperparameters_file(self.algo, env_id)
+            if ours is not None and self.trial_id is not None:
+                raise ValueError(
+                    "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
+                    "give the trial's values with -params instead"
+                )
+            if ours is not None:
+                self.config = str(ours)
+            elif self._spec is not None:
+                self.config = str(zoo_hyperparams() / f"{self.algo}.yml")
+        if self._spec is not None:
+            custom = self.custom_hyperparams or {}
+            entry = hyperparameters_entry(self.algo, env_id)
+            self.custom_hyperparams = {**custom, **self._spec.hyperparameters(entry, custom)}
+        hyperparams, saved_hyperparams = super().read_hyperparameters()
+        self._check_embeddings(hyperparams)
+        self._set_batched_vec_env(hyperparams)
+        if self._spec is not None or batch_class(env_id) is not None:
+            self._set_eval_env_kwargs(hyperparams)
+        return hyperparams, saved_hyperparams
+
+    def _check_embeddings(self, hyperparams: dict[str, Any]) -> None:
+        """Refuse what would change embeddings, and make them on the device of ``--device``."""
+        if encoding_kwargs(hyperparams) is None:
+            return
+        # A copy: config.yml names the device as little as it does for the rest of the run.
+        hyperparams["vec_env_wrapper"] = copy.deepcopy(hyperparams["vec_env_wrapper"])
+        (encoding_kwargs(hyperparams) or {}).setdefault("device", str(self.device))
+        if normalizes_observations(hyperparams.get("normalize", False)):
+            raise ValueError(
+                f"normalize={hyperparams['normalize']!r} would change the embeddings of the frozen encoder; give "
+                '"dict(norm_obs=False, norm_reward=True)"'
+            )
+
+    def _set_batched_vec_env(self, hyperparams: dict[str, Any]) -> None:
+        """Step copies as one batch where that gives the same as ``DummyVecEnv``; any other choice stays."""
+        several = hyperparams.get("n_envs", 1) > 1 and "env_wrapper" not in hyperparams
+        if several and self.vec_env_class is DummyVecEnv and batch_class(self.env_name.gym_id) is not None:
+            self.vec_env_class = BatchedVecEnv
+
+    def _set_eval_env_kwargs(self, hyperparams: dict[str, Any]) -> None:
+        traits = get_traits(self.env_name.gym_id)
+        shared = hyperparams.get("env_kwargs", self.env_kwargs)
+        # Hyperparameters are selected on what training sees, so that the evaluation split stays unseen.
+        if traits.eval_split is not None and not self.optimize_hyperparameters:
+            shared = {name: value for name, value in shared.items() if name not in traits.split_kwargs}
+            self.eval_env_kwargs = {"split": traits.eval_split, **shared, **(self._eval_env_kwargs_args or {})}
+        elif not self._eval_env_kwargs_args:
+            # rl-zoo3 takes those of --env-kwargs alone, and an environment with other arguments may be another task.
+            self.eval_env_kwargs = shared
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
+        """As rl-zoo3 does; ``policy_kwargs`` may name classes by their dotted path.
+
+        :param hyperparams: of :meth:`read_hyperparameters`
+        """
+        self._used = dict(hyperparams)
+        processed, *rest = super()._preprocess_hyperparams(hyperparams)
+        kwargs = resolve_classes(processed.get("policy_kwargs"))
+        if self._spec is not None and isinstance(self._used.get("policy_kwargs"), str):
+            # A text, which rl-zoo3 has just evaluated.
+            kwargs = {**kwargs, **resolve_classes(self._spec.extractor_kwargs())}
+        if kwargs is not None:
+            processed["policy_kwargs"] = kwargs
+        self._record = self._make_record(kwargs or {})
+        return processed, *rest
+
+    def _make_record(self, policy_kwargs: dict[str, Any]) -> MethodRecord:
+        preprocessing = {key: self._used[key] for key in PREPROCESSING_KEYS if key in self._used}
+        encoding = encoding_kwargs(self._used)
+        extractor = policy_kwargs.get("features_extractor_class")
+        if encoding is not None:
+            encoder = encoding["encoder"]
+            file = load_encoder(encoder)
+            return MethodRecord(file.contract["objective"], True, encoder, file.digest, preprocessing)
+        if not (isinstance(extractor, type) and issubclass(extractor, EncoderExtractor)):
+            return MethodRecord(None, False, None, None, preprocessing)
+        kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
+        encoder, digest = kwargs.get("encoder"), None
+        if encoder is not None:
+            try:
+                digest = load_encoder(encoder).digest
+            except EncoderNotFoundError:
+                # A saved model that is continued is complete without it; training a new one is refused later.
+                digest = None
+        return MethodRecord(method_of(extractor), bool(kwargs.get("freeze", False)), encoder, digest, preprocessing)
+
+    def learn(self, model: BaseAlgorithm) -> None:
+        """As rl-zoo3 does.
+
+        :param model: to train
+        """
+        type(self).has_begun = True
+        super().learn(model)
+
+    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
+        super()._save_config(saved_hyperparams)
+        self._record.write(self.params_path)
+        encoding = encoding_kwargs(saved_hyperparams)
+        if encoding is not None:
+            shutil.copyfile(resolve_encoder(encoding["encoder"]), Path(self.params_path) / RUN_COPY)
+
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
+        """Refuse ``-i`` with another extractor: rl-zoo3 keeps the model's, and would record the one asked for."""
+        asked = hyperparams.get("policy_kwargs") or {}
+        model: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
+        try:
+            check_trained_with(model, asked)
+        except ValueError as error:
+            env.close()
+            raise ValueError(f"cannot continue {self.trained_agent}: {error}; give the same --conf-file") from error
+        return model
+
+    def hyperparameters_optimization(self) -> None:
+        """As rl-zoo3 does, except that an extractor of ours survives a trial's ``policy_kwargs``."""
+        extractor = (self._hyperparams.get("policy_kwargs") or {}).get("features_extractor_class")
+        if isinstance(extractor, type) and issubclass(extractor, EncoderExtractor):
+            self._hyperparams = _KeepExtractor(self._hyperparams)
+        super().hyperparameters_optimization()
+
+
+class _KeepExtractor(dict[str, Any]):
+    """Hyperparameters whose ``policy_kwargs`` are merged with those of a trial instead of replaced by them."""
+
+    def copy(self) -> "_KeepExtractor":
+        # Stable-Baselines3 writes into policy_kwargs, so each trial needs its own.
+        return _KeepExtractor(self | {"policy_kwargs": copy.deepcopy(self["policy_kwargs"])})
+
+    def update(self, sampled: dict[str, Any]) -> None:  # type: ignore[override]
+        super().update(sampled | {"policy_kwargs": self["policy_kwargs"] | sampled.get("policy_kwargs", {})})
+
+
+def with_eval_split(make_env: Callable[..., Any]) -> Callable[..., Any]:
+    """``create_test_env`` on the evaluation split, and on the copy of the encoder that a run's folder holds.
+
+    :param make_env: ``rl_zoo3.utils.create_test_env``
+    """
+
+    @functools.wraps(make_env)
+    def create_test_env(
+        env_id: str,
+        n_envs: int = 1,
+        stats_path: str | None = None,
+        *args: Any,
+        hyperparams: dict[str, Any] | None = None,
+        env_kwargs: dict[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        traits = get_traits(env_id)
+        given = env_kwargs or {}
+        if traits.eval_split is not None and not set(traits.split_kwargs) & set(given):
+            env_kwargs = {"split": traits.eval_split, **given}
+        hyperparams = copy.deepcopy(hyperparams)
+        encoding = encoding_kwargs(hyperparams or {})
+        if encoding is not None and stats_path is not None and (Path(stats_path) / RUN_COPY).is_file():
+            encoding["encoder"] = str(Path(stats_path) / RUN_COPY)
+        return make_env(
+            env_id, n_envs, stats_path, *args, hyperparams=hyperparams, env_kwargs=env_kwargs, **kwargs
+        )  # fmt: skip
+
+    create_test_env.is_ours = True  # type: ignore[attr-defined]
+    return create_test_env
+
+
+def install() -> None:
+    """Make rl-zoo3's commands use this manager; a second call does nothing."""
+    exp_manager.ExperimentManager = MethodExperimentManager
+    if not hasattr(rl_utils.create_test_env, "is_ours"):
+        rl_utils.create_test_env = with_eval_split(rl_utils.create_test_env)
+        rl_zoo3.create_test_env = rl_utils.create_test_env

@@ -1,0 +1,283 @@
+"""Methods: which features extractor a zoo run uses, as hyperparameters, and as the record that a run keeps of it."""
+
+import importlib
+import importlib.util
+import json
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.paths import resource_path
+from sb3_abisim.registry import get_method, methods
+
+ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
+# Beside config.yml in a run's folder.
+RECORD_NAME = "method.json"
+# Of policy_kwargs: what a YAML names by its dotted path.
+_CLASS_KEYS = ("features_extractor_class", "optimizer_class", "activation_fn")
+
+
+def grammar() -> str:
+    """How a method spec is written, for messages."""
+    return f"METHOD[=ENCODER][,frozen] with METHOD one of {', '.join(methods())}"
+
+
+@dataclass(frozen=True)
+class MethodSpec:
+    """Which features extractor a run is to use.
+
+    :param name: a registered method
+    :param encoder: a file, a shipped encoder's name or ``hf://owner/repository/file``; None for the shipped encoder of
+        this method and the environment
+    :param frozen: whether the weights stay as they are during RL
+    :raises ValueError: for an unknown method, or an encoder or ``frozen`` for an untrained one
+    """
+
+    name: str
+    encoder: str | None = None
+    frozen: bool = False
+
+    def __post_init__(self) -> None:
+        if self.name not in methods():
+            raise ValueError(f"unknown method {self.name!r}; give {grammar()}")
+        if self.encoder == "":
+            raise ValueError(f"no encoder after '{self.name}='; give {grammar()}")
+        if not get_method(self.name).is_pretrained and (self.encoder is not None or self.frozen):
+            raise ValueError(
+                f"{self.name!r} trains its network from scratch: it takes neither an encoder nor ',frozen'"
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> "MethodSpec":
+        """Read ``METHOD[=ENCODER][,frozen]``.
+
+        :param text: e.g. "ssi", "abisim,frozen" or "abisim=runs/mine.safetensors"
+        :raises ValueError: for anything else
+        """
+        head, equals, encoder = text.removesuffix(",frozen").partition("=")
+        return cls(head, encoder if equals else None, frozen=text.endswith(",frozen"))
+
+    @classmethod
+    def of_conf_file(cls, config: str) -> "MethodSpec | None":
+        """The method that ``--conf-file`` names; None when it names a file or a module, as in plain rl-zoo3.
+
+        :param config: the word after ``--conf-file``
+        :raises ValueError: when it is none of these
+        """
+        if re.split("[=,]", config)[0] in methods():
+            return cls.parse(config)
+        if not config.endswith((".yml", ".yaml", ".py")) and importlib.util.find_spec(config.partition(".")[0]) is None:
+            raise ValueError(
+                f"--conf-file {config!r} is no YAML or Python file, module or method; a method is {grammar()}"
+            )
+        return None
+
+    def hyperparameters(self, entry: Mapping[str, Any], given: Collection[str] = ()) -> dict[str, Any]:
+        """What this method puts in place of an entry's values; all else stays.
+
+        :param entry: of a zoo YAML; where its ``policy_kwargs`` name a shipped encoder ("Nav2D-v0/abisim"), a method
+            without an encoder takes its own of the same environment
+        :param given: names of hyperparameters that the user sets
+        :return: ``policy``, and for a frozen encoder ``vec_env_wrapper``; ``policy_kwargs``, unless the entry gives
+            them as a text, which :meth:`extractor_kwargs` joins once rl-zoo3 has evaluated it
+        :raises ValueError: when the method has no encoder, or sets what the user sets
+        """
+        replaced: dict[str, Any] = {}
+        kwargs = entry.get("policy_kwargs") or {}
+        if isinstance(kwargs, Mapping):
+            encoder = (kwargs.get("features_extractor_kwargs") or {}).get("encoder")
+            own = self.extractor_kwargs(encoder)
+            rest = {name: value for name, value in kwargs.items() if not name.startswith("features_extractor_")}
+            replaced["policy_kwargs"] = {**own, **rest}
+        else:
+            encoder = None
+        policy = str(entry.get("policy", "CnnPolicy"))
+        # An entry for vectors, as rl-zoo3's "default" is, has the policy without an extractor for images.
+        replaced["policy"] = policy.replace("Cnn", "Mlp") if self.frozen else policy.replace("Mlp", "Cnn")
+        if self.frozen:
+            wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
+            replaced["vec_env_wrapper"] = [wrapper]
+        for name in sorted(replaced.keys() & set(given)):
+            raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
+        return replaced
+
+    def extractor_kwargs(self, shipped: str | None = None) -> dict[str, Any]:
+        """The part of ``policy_kwargs`` that chooses the features extractor, classes by their dotted path.
+
+        :param shipped: name of a shipped encoder of the environment, of any method; None if there is none
+        :raises ValueError: when the method needs an encoder, and there is none
+        """
+        if self.frozen:
+            return {}
+        method = get_method(self.name)
+        kwargs: dict[str, Any] = {"features_extractor_class": f"sb3_abisim.{method.extractor}"}
+        if method.is_pretrained:
+            kwargs["features_extractor_kwargs"] = {"encoder": self._encoder(shipped)}
+        return kwargs
+
+    def _encoder(self, shipped: str | None) -> str:
+        if self.encoder is not None:
+            return self.encoder
+        if shipped is None:
+            raise ValueError(
+                f"no encoder ships for this environment; pretrain one and give its file: --conf-file {self.name}=FILE"
+                + ",frozen" * self.frozen
+            )
+        return f"{shipped.rpartition('/')[0]}/{self.name}"
+
+
+@dataclass(frozen=True)
+class MethodRecord:
+    """What a run used, written beside its configuration as JSON; reports read it.
+
+    :param method: a registered name; None for a features extractor that is none of ours
+    :param frozen: whether the weights stayed as they were
+    :param encoder: path or name of the encoder file; None without one
+    :param encoder_hash: sha256 of the encoder file; None without one
+    :param preprocessing: hyperparameters that stand between the environment and the encoder, where they are given
+    """
+
+    method: str | None
+    frozen: bool
+    encoder: str | None
+    encoder_hash: str | None
+    preprocessing: dict[str, Any]
+
+    @property
+    def label(self) -> str | None:
+        """What reports call it: "abisim", "abisim,frozen"; None for no method of ours."""
+        return None if self.method is None else self.method + ",frozen" * self.frozen
+
+    def write(self, folder: str | Path) -> None:
+        """Write it into the folder of ``config.yml``.
+
+        :param folder: exists
+        """
+        text = json.dumps(asdict(self), indent=1, sort_keys=True) + "\n"
+        write_atomic(Path(folder) / RECORD_NAME, lambda file: file.write(text.encode()))
+
+    @classmethod
+    def read(cls, folder: str | Path) -> "MethodRecord | None":
+        """Read it; None where there is none, as in runs of plain rl-zoo3.
+
+        :param folder: of ``config.yml``
+        :raises ValueError: for a damaged file
+        """
+        path = Path(folder) / RECORD_NAME
+        if not path.is_file():
+            return None
+        try:
+            return cls(**json.loads(path.read_bytes()))
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} is damaged ({error}); leave the run out, or copy the file again") from error
+
+
+PREPROCESSING_KEYS = ("env_wrapper", "frame_stack", "normalize")
+
+
+def hyperparameters_file(algo: str, env_id: str) -> Path | None:
+    """The YAML file of this package with hyperparameters of an algorithm for an environment.
+
+    :param algo: rl-zoo3's name of the algorithm, e.g. "ppo"
+    :param env_id: any id
+    :return: None for an environment that is in none of the files
+    :raises ValueError: when only other algorithms have some, naming these
+    """
+    files = [path for path in sorted(resource_path("hyperparams").glob("*.yml")) if env_id in read_entries(path)]
+    for path in files:
+        if path.stem == algo:
+            return path
+    if not files:
+        return None
+    known = ", ".join(path.stem for path in files)
+    raise ValueError(
+        f"sb3_abisim has no hyperparameters of {algo} for {env_id}, only of: {known}; "
+        "choose one of these with --algo, or give a YAML file of your own with --conf-file"
+    )
+
+
+def hyperparameters_entry(algo: str, env_id: str) -> dict[str, Any]:
+    """The hyperparameters of an algorithm for an environment: this package's, else rl-zoo3's own.
+
+    :param algo: rl-zoo3's name of the algorithm
+    :param env_id: a registered id
+    :raises ValueError: when there are none
+    """
+    path = hyperparameters_file(algo, env_id)
+    if path is not None:
+        return dict(read_entries(path)[env_id])
+    exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
+    path = zoo_hyperparams() / f"{algo}.yml"
+    entries = read_entries(path) if path.is_file() else {}
+    key = "atari" if exp_manager.ExperimentManager.is_atari(env_id) else "default"
+    for name in (env_id, key, "default"):
+        if name in entries:
+            return dict(entries[name])
+    raise ValueError(f"rl-zoo3 has no hyperparameters of {algo} for {env_id}; choose another with --algo")
+
+
+def zoo_hyperparams() -> Path:
+    """The folder of rl-zoo3's own hyperparameters."""
+    module: Any = importlib.import_module("rl_zoo3")
+    return Path(module.__file__).parent / "hyperparams"
+
+
+def read_entries(path: Path) -> dict[str, Any]:
+    """The entries of a zoo YAML by environment id; empty for a file of another form.
+
+    :param path: the file
+    """
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    return content if isinstance(content, dict) else {}
+
+
+def resolve_classes(policy_kwargs: Any) -> Any:
+    """Import what ``policy_kwargs`` name by a dotted path, such as ``activation_fn: torch.nn.ReLU``.
+
+    :param policy_kwargs: of a zoo entry, a mapping; anything else is returned as it is
+    :return: a new dictionary
+    :raises ValueError: for a path that cannot be imported
+    """
+    if not isinstance(policy_kwargs, Mapping):
+        return policy_kwargs
+    kwargs = dict(policy_kwargs)
+    for key in _CLASS_KEYS:
+        if isinstance(kwargs.get(key), str):
+            module, _, name = kwargs[key].rpartition(".")
+            try:
+                kwargs[key] = getattr(importlib.import_module(module), name)
+            except (ImportError, AttributeError, ValueError) as error:
+                raise ValueError(
+                    f"policy_kwargs: cannot import {key} {kwargs[key]!r} ({error}); give its dotted path"
+                ) from error
+    return kwargs
+
+
+def encoding_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The arguments of ``VecEncodeObservations`` in a zoo entry, None where it is not used.
+
+    :param hyperparams: of a zoo entry, or of a run's ``config.yml``
+    """
+    wrappers: Any = hyperparams.get("vec_env_wrapper")
+    for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
+        name = next(iter(wrapper), "") if isinstance(wrapper, dict) else ""
+        if name.rpartition(".")[2] == ENCODING_WRAPPER.rpartition(".")[2]:
+            kwargs: dict[str, Any] = wrapper[name]
+            return kwargs
+    return None
+
+
+def normalizes_observations(normalize: Any) -> bool:
+    """Whether the zoo's ``normalize`` makes VecNormalize change observations.
+
+    :param normalize: of a zoo entry: a bool, a dictionary, or the text of either
+    """
+    if isinstance(normalize, dict):
+        return bool(normalize.get("norm_obs", True))
+    text = str(normalize or False)
+    return text not in ("False", "None") and re.search(r"norm_obs['\"]?\s*[=:]\s*False", text) is None

@@ -1,0 +1,241 @@
+"""Read the run folders of rl-zoo3, whoever made them, without executing anything that they hold."""
+
+import dataclasses
+import glob
+import json
+import zipfile
+import zlib
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from sb3_abisim.zoo.methods import MethodRecord, encoding_kwargs
+
+
+class _Loader(yaml.SafeLoader):
+    """The zoo writes ``!!python`` tags; these two are data, all others are refused."""
+
+
+_Loader.add_constructor(
+    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
+    lambda loader, node: OrderedDict(*loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
+)
+# Of a class or function, its name.
+_Loader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda loader, suffix, node: suffix)
+_Loader.add_constructor(
+    "tag:yaml.org,2002:python/tuple",
+    lambda loader, node: tuple(loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
+)
+
+
+# The training episodes of an exported run, averaged: see Run.training.
+TRAINING_CURVE = "training.npz"
+
+
+class NoEpisodesError(ValueError):
+    """No episode of training has ended."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """Returns over the course of a run.
+
+    :param steps: environment steps, rising, shape (n,)
+    :param returns: mean return at each, shape (n,)
+    :param successes: share of successful episodes at each, shape (n,); None where the run does not say
+    """
+
+    steps: NDArray[np.int64]
+    returns: NDArray[np.float64]
+    successes: NDArray[np.float64] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A zoo run.
+
+    :param folder: where it lies
+    :param label: the method, such as "abisim,frozen", or the algorithm without a method of ours
+    :param record: what it used; None for a run of plain rl-zoo3
+    :param env_id: trained in
+    :param env_name: what rl-zoo3 makes of it in the names of files (my-Toy-v0 for my/Toy-v0)
+    :param algo: rl-zoo3's name
+    :param seed: of RL
+    :param n_timesteps: budget that was asked for
+    :param env_kwargs: of training
+    :param settings: all that two runs which differ only in seeds and encoder files have in common
+    :param command: that made it
+    :param n_eval_episodes: of each evaluation during training
+    """
+
+    folder: Path
+    label: str
+    record: MethodRecord | None
+    env_id: str
+    env_name: str
+    algo: str
+    seed: int
+    n_timesteps: int
+    env_kwargs: dict[str, Any]
+    settings: dict[str, Any]
+    command: str
+    n_eval_episodes: int
+
+    def evaluations(self) -> Curve:
+        """The zoo's evaluations during training.
+
+        :raises ValueError: if there are none
+        """
+        path = self.folder / "evaluations.npz"
+        if not path.is_file():
+            raise ValueError(f"{self.folder} holds no evaluations.npz; train with an --eval-freq above 0")
+        return _read_curve(path)
+
+    def training(self, n_points: int = 50) -> Curve:
+        """The episodes of training itself, with the exploring policy, averaged over equal stretches of steps.
+
+        Exported runs hold this curve instead of the episodes, with the default number of stretches.
+
+        :param n_points: stretches; those in which no episode ended are left out
+        :raises ValueError: if there are neither episodes nor their curve
+        """
+        from stable_baselines3.common.monitor import load_results
+
+        if not list(self.folder.glob("*.monitor.csv")):
+            if (self.folder / TRAINING_CURVE).is_file():
+                return _read_curve(self.folder / TRAINING_CURVE)
+            what = f"{self.folder} holds neither *.monitor.csv nor {TRAINING_CURVE}"
+            raise ValueError(f"{what}; take --source evaluations, or the folder that it was exported from")
+        # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
+        episodes = load_results(glob.escape(str(self.folder)))
+        if not len(episodes):
+            raise NoEpisodesError(f"no episode of {self.folder} has ended yet; try again later, or leave the run out")
+        ends = episodes["l"].cumsum().to_numpy()
+        stretch = np.minimum((ends - 1) * n_points // max(self.n_timesteps, int(ends[-1])), n_points - 1)
+        width = max(self.n_timesteps, int(ends[-1])) / n_points
+        kept = np.unique(stretch)
+        columns = [episodes[name].to_numpy(float) for name in ("r", "is_success") if name in episodes]
+        means = [np.array([column[stretch == k].mean() for k in kept]) for column in columns]
+        return Curve(((kept + 1) * width).astype(np.int64), means[0], means[1] if len(means) == 2 else None)
+
+    def final(self) -> dict[str, NDArray[Any]] | None:
+        """What :mod:`sb3_abisim.zoo.evaluate` wrote: ``<mode>/<split>/results`` and so on; None if it did not."""
+        path = self.folder / "final_evaluations.npz"
+        return dict(np.load(path, allow_pickle=False)) if path.is_file() else None
+
+
+def _read_curve(path: Path) -> Curve:
+    """A curve from arrays as the zoo's EvalCallback writes them.
+
+    :param path: an npz file with ``timesteps`` (n,), ``results`` (n, n_episodes) and, if known, ``successes`` alike
+    :raises ValueError: if it cannot be read
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
+            successes = data["successes"].mean(axis=1) if "successes" in data else None
+            return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path} is damaged or being written ({error!r}); try again, or leave the run out") from error
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read a run folder.
+
+    :param folder: ``.../<algo>/<Env-vN>_<id>``
+    :raises ValueError: if it is none
+    """
+    folder = Path(folder)
+    found = list(folder.glob("*/args.yml"))
+    if len(found) != 1:
+        raise ValueError(f"{folder} is no run folder of rl-zoo3 (no <Env>/args.yml in it)")
+    args, config = read_yaml(found[0]), read_yaml(found[0].with_name("config.yml"))
+    record = MethodRecord.read(found[0].parent)
+    try:
+        n_timesteps = int(args["n_timesteps"] if args["n_timesteps"] > 0 else config["n_timesteps"])
+        command = found[0].with_name("command.txt")
+        # What names the encoder's file differs between encoder seeds; the label says whatever else is in there.
+        plain = {name: value for name, value in config.items() if name not in ("policy_kwargs", "n_timesteps")}
+        (encoding_kwargs(plain) or {}).pop("encoder", None)
+        plain["policy_kwargs"] = _without_encoder(config.get("policy_kwargs"))
+        names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
+        return Run(
+            folder=folder,
+            label=(record and record.label) or str(args["algo"]),
+            record=record,
+            env_id=args["env"],
+            env_name=found[0].parent.name,
+            algo=args["algo"],
+            seed=int(args["seed"]),
+            n_timesteps=n_timesteps,
+            env_kwargs=config.get("env_kwargs") or args["env_kwargs"] or {},
+            settings={**{name: args[name] for name in names}, "n_timesteps": n_timesteps, **plain},
+            command=command.read_text() if command.is_file() else "",
+            n_eval_episodes=int(args["eval_episodes"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{found[0]} was not written by rl_zoo3.train ({error!r})") from error
+
+
+def find_runs(folder: str | Path) -> list[Run]:
+    """All runs below a folder, or those of the last command of a benchmark's folder.
+
+    :param folder: a benchmark's folder, a zoo's log folder, or a run's own
+    :raises ValueError: if there are none
+    """
+    folder = Path(folder)
+    index = folder / "benchmark.json"
+    if index.is_file():
+        entries = json.loads(index.read_bytes())["runs"]
+        runs = [
+            dataclasses.replace(read_run(folder / entry["folder"]), label=entry["label"])
+            for entry in entries
+            if (folder / entry["folder"]).is_dir()
+        ]
+    else:
+        paths = sorted(path.parent.parent for path in folder.glob("**/args.yml"))
+        # Where a benchmark's cells work is nothing that is done.
+        runs = [read_run(path) for path in paths if not path.relative_to(folder).as_posix().startswith("work/run-")]
+    if not runs:
+        raise ValueError(f"no run folders of rl-zoo3 below {folder}; train first, or give its log folder")
+    return runs
+
+
+def is_deterministic(env_id: str) -> bool | None:
+    """Whether the zoo's evaluations during training take the most likely action.
+
+    :param env_id: trained in
+    :return: None where the environment is not registered here
+    """
+    import gymnasium as gym
+    from rl_zoo3.exp_manager import ExperimentManager
+
+    if env_id not in gym.registry:
+        return None
+    return not (ExperimentManager.is_atari(env_id) or ExperimentManager.is_minigrid(env_id))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file of rl-zoo3 as data; its Python objects become names.
+
+    :param path: ``args.yml`` or ``config.yml``
+    :raises ValueError: if it cannot be read
+    """
+    try:
+        return dict(yaml.load(path.read_text(encoding="utf-8"), _Loader))
+    except (OSError, yaml.YAMLError, TypeError) as error:
+        raise ValueError(f"cannot read {path} ({error}); was it written by rl_zoo3.train?") from error
+
+
+def _without_encoder(policy_kwargs: Any) -> Any:
+    """What two runs that differ in their encoder files alone have in common."""
+    if not isinstance(policy_kwargs, dict):
+        return policy_kwargs
+    kwargs = {**policy_kwargs}
+    if isinstance(kwargs.get("features_extractor_kwargs"), dict):
+        inner = kwargs["features_extractor_kwargs"]
+        kwargs["features_extractor_kwargs"] = {name: value for name, value in inner.items() if name != "encoder"}
+    return kwargs
