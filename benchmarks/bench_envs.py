@@ -80,9 +80,9 @@ class PlainNav2D(gym.Env[np.ndarray, int]):
                 return True
             visited.add(cell)
             for move in self.moves:
-                neighbour = np.array(cell) + move
-                if self._is_free(neighbour):
-                    heapq.heappush(queue, (self._distance(neighbour) + cost + 1, cost + 1, tuple(neighbour)))
+                neighbor = np.array(cell) + move
+                if self._is_free(neighbor):
+                    heapq.heappush(queue, (self._distance(neighbor) + cost + 1, cost + 1, tuple(neighbor)))
         return False
 
     def _observe(self) -> np.ndarray:
@@ -126,7 +126,7 @@ def single(env: gym.Env[Any, Any], render: bool = False) -> Callable[[float], fl
     return run
 
 
-def vectorised(env: gym.vector.VectorEnv) -> Callable[[float], float]:
+def vectorized(env: gym.vector.VectorEnv) -> Callable[[float], float]:
     """The same for a batch, counting the steps of all copies."""
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -158,7 +158,7 @@ def contenders() -> dict[tuple[str, int], Callable[[float], float]]:
         if n == 1:
             runs[env_id, n] = single(gym.make(env_id))
         else:
-            runs[env_id, n] = vectorised(gym.make_vec(env_id, num_envs=n, vectorization_mode="vector_entry_point"))
+            runs[env_id, n] = vectorized(gym.make_vec(env_id, num_envs=n, vectorization_mode="vector_entry_point"))
     return runs
 
 

@@ -2,7 +2,7 @@
 
 The straightforward loop is a ``torch.utils.data.Dataset`` that indexes one transition after the other and makes it
 float32, a ``DataLoader`` that shuffles and stacks them, pictures channels first, and Adam. Ours is measured with single
-transitions and, where both ends are embedded by the trained encoder, with ``run_length: 8``. The loops run in turns on
+transitions and, where both ends are embedded by the trained encoder, with ``chunk_length: 8``. The loops run in turns on
 one core, each in a process of its own, because ours sets the allocator (``sb3_abisim.common.malloc``). The speed of each is
 that of its fastest turn, by processor time, which load on the machine disturbs less than the clock. ``make bench``.
 """
@@ -36,7 +36,7 @@ def straightforward(run: Any) -> Iterator[float]:
     dataset = run.dataset
     shards = [np.load(path, mmap_mode="r") for path in sorted(dataset.path.glob("frames-*.npy"))]
     offsets = np.cumsum([0] + [len(shard) for shard in shards])
-    starts = dataset.valid_starts(part="train")
+    starts = dataset.valid_starts(split="train")
     actions = dataset.actions(np.arange(dataset.n_frames))
 
     class Transitions(th.utils.data.Dataset[Any]):
@@ -69,7 +69,7 @@ def ours(run: Any) -> Iterator[float]:
         yield float(run._update(batch)["loss"])
 
 
-def make_run(objective: str, data: Path, base: str | None, folder: Path, run_length: int = 1) -> Any:
+def make_run(objective: str, data: Path, base: str | None, folder: Path, chunk_length: int = 1) -> Any:
     """A pretraining run that has not begun."""
     from sb3_abisim.data.dataset import TransitionDataset
     from sb3_abisim.pretraining.config import load_config
@@ -77,26 +77,26 @@ def make_run(objective: str, data: Path, base: str | None, folder: Path, run_len
 
     dataset = TransitionDataset(data, verify=False)
     config = load_config(
-        objective, dataset.env_id, {"batch_size": BATCH_SIZE, "n_updates": 10**6, "run_length": run_length}
+        objective, dataset.env_id, {"batch_size": BATCH_SIZE, "n_updates": 10**6, "chunk_length": chunk_length}
     )
     return PretrainRun(objective, dataset, folder / "x.safetensors", config, base, seed=0, device="cpu")
 
 
-def serve_turns(pipe: Any, objective: str, data: Path, base: str | None, run_length: int) -> None:
+def serve_turns(pipe: Any, objective: str, data: Path, base: str | None, chunk_length: int) -> None:
     """In a process of its own: for every number of updates received, send the transitions per second; stop at 0.
 
     :param pipe: the process's end of a pipe
-    :param run_length: of our loop; 0 for the straightforward one
+    :param chunk_length: of our loop; 0 for the straightforward one
     """
     use_one_core()
-    if run_length:
+    if chunk_length:
         from sb3_abisim.common.malloc import keep_freed_memory
 
         # As sb3_abisim.pretraining.pretrain does.
         keep_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
-        run = make_run(objective, data, base, Path(folder), max(run_length, 1))
-        loop = ours(run) if run_length else straightforward(run)
+        run = make_run(objective, data, base, Path(folder), max(chunk_length, 1))
+        loop = ours(run) if chunk_length else straightforward(run)
         next(loop)
         while n_updates := pipe.recv():
             start = time.process_time()
@@ -106,16 +106,16 @@ def serve_turns(pipe: Any, objective: str, data: Path, base: str | None, run_len
 
 
 def fastest_turns(
-    objective: str, data: Path, base: str | None, run_lengths: list[int], rounds: int, n_updates: int
+    objective: str, data: Path, base: str | None, chunk_lengths: list[int], rounds: int, n_updates: int
 ) -> dict[int, float]:
-    """Transitions per second of the fastest turn of each loop, by its ``run_length`` (:func:`serve_turns`)."""
+    """Transitions per second of the fastest turn of each loop, by its ``chunk_length`` (:func:`serve_turns`)."""
     context = multiprocessing.get_context("spawn")
     pipes = {}
-    for length in run_lengths:
+    for length in chunk_lengths:
         pipes[length], theirs = context.Pipe()
         context.Process(target=serve_turns, args=(theirs, objective, data, base, length), daemon=True).start()
         theirs.close()
-    best = dict.fromkeys(run_lengths, 0.0)
+    best = dict.fromkeys(chunk_lengths, 0.0)
     for _ in range(rounds):
         for length, pipe in pipes.items():
             pipe.send(n_updates)
@@ -196,15 +196,15 @@ def main(argv: list[str] | None = None) -> None:
         with tempfile.TemporaryDirectory() as folder:
             data = Path(folder) / "data"
             collect(env_id, N_TRANSITIONS, data)
-            for objective, run_lengths in OBJECTIVES:
+            for objective, chunk_lengths in OBJECTIVES:
                 base = f"{env_id}/ssi" if objective == "abisim" else None
-                speed = fastest_turns(objective, data, base, [0, *run_lengths], args.rounds, args.updates)
+                speed = fastest_turns(objective, data, base, [0, *chunk_lengths], args.rounds, args.updates)
                 plain = speed.pop(0)
                 for length, fast in speed.items():
                     run = make_run(objective, data, base, Path(folder), length)
                     flops = flops_per_update(run) * fast / BATCH_SIZE / 1e9
                     parts = ", ".join(f"{name} {share:.0%}" for name, share in shares(run, 2 * args.updates).items())
-                    label = f"`{objective}`, {env_id}" + (f", `run_length: {length}`" if length > 1 else "")
+                    label = f"`{objective}`, {env_id}" + (f", `chunk_length: {length}`" if length > 1 else "")
                     ratio = fast / plain
                     numbers = f"{plain:,.0f} | {fast:,.0f} | {ratio:.1f} | {AIM:.0f} | {flops:.0f}"
                     rows.append(f"| {label} | {numbers} | {ratio * peak / flops:.1f} |")

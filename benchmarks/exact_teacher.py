@@ -143,8 +143,8 @@ def main() -> None:
             "n_updates": args.n_updates,
             **({} if args.toggle else {"toggle": False}),
         },
-        dataset_digest="exact",
-        golden_observations=frames[:4],
+        dataset_hash="exact",
+        reference_observations=frames[:4],
     )
 
 

@@ -110,7 +110,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         for run in result["runs"]:
             axis.plot(run["curve"]["steps"], run["curve"][name], label=f"PPO, {run['name']}")
         for (agent, scores), style in zip(result["agents"].items(), (":", "--", "-."), strict=True):
-            axis.axhline(scores[name], color="grey", linestyle=style, label=agent)
+            axis.axhline(scores[name], color="gray", linestyle=style, label=agent)
         axis.set(xlabel="steps of all environments", ylabel={"spl": "SPL"}.get(name, name), ylim=(0, 1.02))
     handles, labels = axes[1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize="small")

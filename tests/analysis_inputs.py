@@ -26,8 +26,8 @@ def file_of(layers, shape, objective="ssi", seed=0):
     """An encoder file that was never on a disk."""
     n_features = len(layers.kept) if isinstance(layers, Masked) else int(np.prod(shape[1:]))
     encoder = Encoder(layers, n_features, {})
-    contract = {"objective": objective, "settings": {"seed": seed}, "env_id": "?"}
-    return EncoderFile(Path("nowhere"), "0" * 64, encoder, contract)
+    metadata = {"objective": objective, "settings": {"seed": seed}, "env_id": "?"}
+    return EncoderFile(Path("nowhere"), "0" * 64, encoder, metadata)
 
 
 def identity(shape):

@@ -92,8 +92,8 @@ def write(path: Path, network: str | None = None, objective: str = "abisim", **k
         env_kwargs={},
         objective=objective,
         settings={},
-        dataset_digest="0" * 64,
-        golden_observations=FRAMES[:2],
+        dataset_hash="0" * 64,
+        reference_observations=FRAMES[:2],
     )
     return path
 

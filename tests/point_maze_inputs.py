@@ -4,7 +4,7 @@ import numpy as np
 
 
 def solid_pixels(obstacles: np.ndarray) -> np.ndarray:
-    """Walls and obstacles on the 64 x 64 grid, [row, column], from the centres in metres."""
+    """Walls and obstacles on the 64 x 64 grid, [row, column], from the centers in meters."""
     solid = np.ones((64, 64), dtype=bool)
     solid[2:62, 2:62] = False
     for x, y in obstacles:

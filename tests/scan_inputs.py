@@ -15,9 +15,9 @@ TABLE = (0.8, 0.6, 1.6, 1.2)
 HEIGHT = 2.5
 
 
-def box(x0, y0, x1, y1, z0, z1, colour):
+def box(x0, y0, x1, y1, z0, z1, color):
     mesh = trimesh.creation.box(bounds=[(x0, y0, z0), (x1, y1, z1)])
-    mesh.visual.vertex_colors = (*colour, 255)
+    mesh.visual.vertex_colors = (*color, 255)
     return mesh
 
 
@@ -86,5 +86,5 @@ def empty_room(width=8.0, depth=6.0, walls=()):
     walkable = np.ones(shape, dtype=bool)
     for wall in walls:
         walkable[wall] = False
-    colours = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
-    return ScanMap(colours, np.where(walkable, 0, 1).astype(np.float32), walkable, 0.05, (0.0, depth), "room")
+    colors = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
+    return ScanMap(colors, np.where(walkable, 0, 1).astype(np.float32), walkable, 0.05, (0.0, depth), "room")

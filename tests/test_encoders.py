@@ -31,16 +31,16 @@ def test_every_objective_for_every_environment():
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_shipped_encoder(path):
     file, card = load_encoder(path), json.loads(path.with_suffix(".json").read_text())
-    contract = file.contract
+    metadata = file.metadata
     assert path.stat().st_size < 1_000_000
-    assert (contract["env_id"], contract["objective"]) == (path.parent.name, path.stem)
-    assert card["settings"] == contract["settings"] and card["dataset"]["digest"] == contract["dataset_digest"]
+    assert (metadata["env_id"], metadata["objective"]) == (path.parent.name, path.stem)
+    assert card["settings"] == metadata["settings"] and card["dataset"]["digest"] == metadata["dataset_digest"]
     assert card["dataset"]["n_transitions"] >= 200_000
     committed = load_config(path.stem, path.parent.name).as_settings()
-    assert {key: contract["settings"][key] for key in committed} == committed
+    assert {key: metadata["settings"][key] for key in committed} == committed
     assert card["curves"]["n_updates"][-1] == committed["n_updates"]
     if path.stem == "abisim":
-        assert contract["settings"]["base_digest"] == load_encoder(path.with_stem("ssi")).digest
+        assert metadata["settings"]["base_hash"] == load_encoder(path.with_stem("ssi")).hash
 
 
 def test_the_table_is_made_of_the_cards():

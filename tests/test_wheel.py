@@ -57,5 +57,5 @@ def test_train_from_the_wheel_in_an_empty_folder(installed: Path, tmp_path: Path
     )
     assert done.returncode == 0, done.stderr
     assert f"Loading hyperparameters from: {installed / 'sb3_abisim' / 'hyperparams' / 'ppo.yml'}" in done.stdout
-    assert f"digest {load_encoder('DistractorPointMaze-v0/abisim').digest}" in done.stdout
+    assert f"digest {load_encoder('DistractorPointMaze-v0/abisim').hash}" in done.stdout
     assert (tmp_path / "logs/ppo/DistractorPointMaze-v0_1/DistractorPointMaze-v0.zip").is_file()

@@ -28,6 +28,6 @@ def write_encoder(path: Path, env_id: str, objective: str = "abisim") -> str:
         env_kwargs={},
         objective=objective,
         settings={},
-        dataset_digest="0" * 64,
-        golden_observations=np.stack([env.reset(seed=seed)[0] for seed in range(2)]),
+        dataset_hash="0" * 64,
+        reference_observations=np.stack([env.reset(seed=seed)[0] for seed in range(2)]),
     )

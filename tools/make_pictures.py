@@ -39,7 +39,7 @@ def draw_environments() -> None:
 
 
 def draw_scan_frames() -> None:
-    """First frames of a few episodes of ScanNav, colours above depth, two screen pixels for one of theirs."""
+    """First frames of a few episodes of ScanNav, colors above depth, two screen pixels for one of theirs."""
     env = gym.make("ScanNav-v0")
     columns = []
     for seed in SCAN_SEEDS:

@@ -53,8 +53,8 @@ def exact(
     reference = ExactReference(_check(base_file).encoder.eval(), c, env_id, n_layouts, seed)
     results = {}
     for name, file in files.items():
-        results[name] = {"digest": file.digest, **asdict(reference.compare(file.encoder.eval()))}
-    settings = {"env_id": env_id, "base": base, "base_digest": base_file.digest, "c": c}
+        results[name] = {"hash": file.hash, **asdict(reference.compare(file.encoder.eval()))}
+    settings = {"env_id": env_id, "base": base, "base_hash": base_file.hash, "c": c}
     return {**settings, "n_layouts": n_layouts, "seed": seed, "bins": BINS, "encoders": results}
 
 

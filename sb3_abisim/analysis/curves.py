@@ -28,6 +28,6 @@ def curves(files: dict[str, EncoderFile]) -> dict[str, Any]:
         term = next((term for term in TERMS if term in all_curves), None)
         if term is None:
             raise ValueError(f"the card {path} holds none of the curves {', '.join(TERMS)}")
-        origin = {"digest": file.digest, "objective": file.contract["objective"]}
+        origin = {"hash": file.hash, "objective": file.metadata["objective"]}
         encoders[name] = {**origin, "term": term, "curves": all_curves}
     return {"encoders": encoders}

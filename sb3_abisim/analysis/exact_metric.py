@@ -35,7 +35,7 @@ def action_bisim_metric(
     :param other_transitions: of the second MDP, in the same form with m for n; None for the first one's
     :param c: weight of the recursive term, 0 <= c < 1
     :param action_weights: the distribution that E_a takes, (n_actions,) or one per pair, (n, m, n_actions); None
-        for the uniform one. See :func:`behaviour_weights`
+        for the uniform one. See :func:`behavior_weights`
     :param tol: largest error of the result, relative to the largest base distance
     :return: (n, m)
     :raises ValueError: for shapes that do not fit, or values out of range
@@ -67,8 +67,8 @@ def action_bisim_metric(
     return distance
 
 
-def behaviour_weights(policy: Floats, other_policy: Floats) -> Floats:
-    """The distribution of the common action where two states' actions are drawn from behaviour policies and agree.
+def behavior_weights(policy: Floats, other_policy: Floats) -> Floats:
+    """The distribution of the common action where two states' actions are drawn from behavior policies and agree.
 
     This is what pairs of recorded transitions that took the same action follow.
 

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 
 from sb3_abisim.analysis import curves, leak, perturbation, pixels, plots, plots_pixels, probes, sweep
-from sb3_abisim.analysis import neighbors as neighbours
+from sb3_abisim.analysis import neighbors as neighbors
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.envs import ENV_IDS
@@ -70,9 +70,9 @@ FIGURES = {
         "perturbation maps of the point mazes: an obstacle moved, the clip swapped", pixels.ENV_IDS,
         ("PointMaze-v0", "DistractorPointMaze-v0"), 1500, "states", pixels.pixel_maps, plots_pixels.draw_pixel_maps,
     ),
-    "neighbours": Figure(
-        "nearest neighbours in embedding space", ALL_IDS, ALL_IDS[:1], 500, "episodes", neighbours.neighbours,
-        plots_pixels.draw_neighbours,
+    "neighbors": Figure(
+        "nearest neighbors in embedding space", ALL_IDS, ALL_IDS[:1], 500, "episodes", neighbors.neighbors,
+        plots_pixels.draw_neighbors,
     ),
     "probes": Figure(
         "what probes read from embeddings, and the distractor-invariance ratio", ALL_IDS,
@@ -100,9 +100,9 @@ def default_encoders(env_id: str, trained: Path | None = None) -> list[str]:
     shipped = resource_path("encoders") / SAME_PICTURES.get(env_id, env_id)
     names = [f"{path.parent.name}/{path.stem}" for path in sorted(shipped.glob("*.safetensors"), reverse=True)]
     if trained is not None:
-        there = {load_encoder(name).digest for name in names}
+        there = {load_encoder(name).hash for name in names}
         paths = sorted((trained / env_id).glob("*.safetensors"), reverse=True)
-        names += [str(path) for path in paths if load_encoder(str(path)).digest not in there]
+        names += [str(path) for path in paths if load_encoder(str(path)).hash not in there]
     if not names:
         raise ValueError(f"no encoder ships for {env_id}; name the files to look at")
     return names
@@ -164,7 +164,7 @@ def make_sweep(
     (base_file,) = load_all([base], env_id).values()
     files = sweep.sweep_encoders(values, base, folder, data, env_id)
     results = perturbation.sweep_maps(files, base_file.encoder.eval(), env_id, size)
-    settings = {"figure": "sweep", "env_id": env_id, "size": size, "base": base, "base_digest": base_file.digest}
+    settings = {"figure": "sweep", "env_id": env_id, "size": size, "base": base, "base_hash": base_file.hash}
     return write_figure(settings | results, plots.draw_sweep, images, numbers)
 
 

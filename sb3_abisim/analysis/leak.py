@@ -108,7 +108,7 @@ def _score(pixels: NDArray[np.uint8], actions: NDArray[Any]) -> float:
 
 
 def paint_action(next_frames: NDArray[np.uint8], actions: NDArray[Any]) -> NDArray[np.uint8]:
-    """The paper's example: a display of the last action in the top left corner of s_{t+1}, as grey levels.
+    """The paper's example: a display of the last action in the top left corner of s_{t+1}, as gray levels.
 
     :param next_frames: uint8 (n, channels, height, width)
     :param actions: int (n,), or float (n, action_dim) in -1..1, of which the first two channels show the first two

@@ -1,8 +1,8 @@
-"""Nearest neighbours in embedding space: what do states that an encoder takes for alike have in common?
+"""Nearest neighbors in embedding space: what do states that an encoder takes for alike have in common?
 
-A state's neighbour is the nearest state (L1 distance of embeddings) of any other episode, so in another layout. If the
-encoder follows the agent, neighbours have it in like places; if it follows obstacles, neighbours have like
-surroundings; if it follows the background, neighbours share their clip. Each is held against random pairs of states.
+A state's neighbor is the nearest state (L1 distance of embeddings) of any other episode, so in another layout. If the
+encoder follows the agent, neighbors have it in like places; if it follows obstacles, neighbors have like
+surroundings; if it follows the background, neighbors share their clip. Each is held against random pairs of states.
 """
 
 from typing import Any
@@ -20,24 +20,24 @@ PER_EPISODE = 10
 N_PICTURED = 4
 
 
-def neighbours(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
-    """Nearest neighbours among states of held-out layouts, by setting (:func:`clip_settings`).
+def neighbors(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
+    """Nearest neighbors among states of held-out layouts, by setting (:func:`clip_settings`).
 
     :param files: encoders by name
     :param env_id: a registered id of ours
     :param n_episodes: :data:`PER_EPISODE` states of each make up the pool, and every one of them is a query
     :param seed: of the episodes
     :return: ``settings``: per encoder and for random pairs ``agent`` (mean distance of the two agents, in cells or
-        metres), ``obstacles`` (correlation of the surroundings, :func:`similarity`), ``same_clip`` (share; None without
+        meters), ``obstacles`` (correlation of the surroundings, :func:`similarity`), ``same_clip`` (share; None without
         clips), and ``examples`` of a few queries; ``pictures``, not for JSON: by setting, the queries' and each
-        encoder's neighbours'
+        encoder's neighbors'
     """
     settings, pictures = {}, {}
     for setting, env_kwargs in clip_settings(env_id).items():
         samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, env_kwargs)
         settings[setting], pictures[setting] = _setting(files, samples, seed)
-    digests = {name: file.digest for name, file in files.items()}
-    return {"per_episode": PER_EPISODE, "digests": digests, "settings": settings, "pictures": pictures}
+    hashes = {name: file.hash for name, file in files.items()}
+    return {"per_episode": PER_EPISODE, "digests": hashes, "settings": settings, "pictures": pictures}
 
 
 def _setting(
@@ -73,7 +73,7 @@ def nearest_elsewhere(
     :raises ValueError: if there is one episode only
     """
     if len(np.unique(episodes)) < 2:
-        raise ValueError("neighbours are sought in other episodes, got one episode; use at least 2")
+        raise ValueError("neighbors are sought in other episodes, got one episode; use at least 2")
     nearest, distances = [], []
     numbers = th.as_tensor(episodes)
     for rows in th.split(th.arange(len(features)), 512):
@@ -90,7 +90,7 @@ def similarity(samples: Samples, partners: NDArray[np.int64]) -> dict[str, Any]:
 
     :param samples: with factors
     :param partners: index of each sample's partner, (n,)
-    :return: ``agent``, ``obstacles``, ``same_clip`` as in :func:`neighbours`; the surroundings are correlated as 24
+    :return: ``agent``, ``obstacles``, ``same_clip`` as in :func:`neighbors`; the surroundings are correlated as 24
         numbers 0 or 1 each less their mean over all samples, so that 0 is what chance gives
     """
     everyone = np.arange(len(samples))

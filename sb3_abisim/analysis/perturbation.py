@@ -79,7 +79,7 @@ def sweep_maps(files: dict[float, EncoderFile], base: Encoder, env_id: str, n_la
 
 def _map(file: EncoderFile, layouts: NDArray[np.bool_]) -> dict[str, Any]:
     maps = learned_maps(file.encoder.eval(), layouts)
-    return {"digest": file.digest, "map": mean_map(maps).tolist(), "profile": profile(maps).tolist()}
+    return {"hash": file.hash, "map": mean_map(maps).tolist(), "profile": profile(maps).tolist()}
 
 
 def structure_maps(files: dict[str, EncoderFile], env_id: str, n_layouts: int) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def structure_maps(files: dict[str, EncoderFile], env_id: str, n_layouts: int) -
     :param env_id: a key of :data:`STRUCTURE_IDS`
     :param n_layouts: held-out layouts to average over
     :return: per encoder ``cells``, (15, 15), ``kinds`` (mean by kind of cell, relative to reachable cells) and
-        ``profiles`` (mean by kind and distance, relative to reachable neighbours)
+        ``profiles`` (mean by kind and distance, relative to reachable neighbors)
     :raises ValueError: for an environment without fixed structure
     """
     if env_id not in STRUCTURE_IDS:
@@ -110,7 +110,7 @@ def structure_maps(files: dict[str, EncoderFile], env_id: str, n_layouts: int) -
         means = np.divide(sums, counts, out=np.full(N_CELLS, np.nan), where=counts > 0)
         reference = np.nanmean(means[structure == "."])
         encoders[name] = {
-            "digest": file.digest,
+            "hash": file.hash,
             "cells": means.reshape(SIZE, SIZE).tolist(),
             "kinds": {label: float(np.nanmean(means[structure == kind]) / reference) for kind, label in KINDS.items()},
             "profiles": {label: (values / nearest).tolist() for label, values in profiles.items()},
@@ -163,7 +163,7 @@ def near_and_far(files: dict[str, EncoderFile], env_id: str, n_samples: int, see
         features = [embed(file.encoder.eval(), np.array(frames)) for frames in (before, elsewhere, near, far)]
         moved, here, there = ((x - features[0]).abs().sum(dim=1).double() for x in features[1:])
         encoders[name] = {
-            "digest": file.digest,
+            "hash": file.hash,
             "near": _rounded(here / moved.mean()),
             "far": _rounded(there / moved.mean()),
             "near_share": float((here > there).double().mean()),

@@ -1,6 +1,6 @@
 """Perturbations in pixel space: point mazes drawn again from changed simulator states.
 
-One obstacle is moved by a metre and all else stays: agent, other obstacles and, in Distractor PointMaze, the frame of
+One obstacle is moved by a meter and all else stays: agent, other obstacles and, in Distractor PointMaze, the frame of
 the clip behind them. For comparison the agent is moved by as much, the state is replaced by another one, and (in
 Distractor PointMaze) the clip is swapped under the same state. Clips are those of pretraining and, apart from them,
 unseen ones.
@@ -17,19 +17,19 @@ from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, sample_episode
 from sb3_abisim.envs.backgrounds.clips import SPLITS, Backgrounds
 from sb3_abisim.envs.backgrounds.load import load_backgrounds
 from sb3_abisim.envs.point_maze.env import ROOM_SIZE
-from sb3_abisim.envs.point_maze.layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METRE
+from sb3_abisim.envs.point_maze.layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METER
 from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import EncoderFile
 
 ENV_IDS = ("PointMaze-v0", "DistractorPointMaze-v0", "ContinuousPointMaze-v0", "ContinuousDistractorPointMaze-v0")
 STEP = 1.0  # m, how far an obstacle or the agent is moved
-# Distances in metres from the agent's centre to the nearest edge of the obstacle, before or after the move.
+# Distances in meters from the agent's center to the nearest edge of the obstacle, before or after the move.
 BINS = ((0.0, 0.6), (0.6, 1.2), (1.2, 2.0), (2.0, 3.0), (3.0, 5.0), (5.0, 15.0))
 MAP_REACH = 8  # m
 MIN_SAMPLES = 5
 
-_HALF = OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
+_HALF = OBSTACLE_PIXELS / PIXELS_PER_METER / 2
 
 
 def has_clips(env_id: str) -> bool:
@@ -52,7 +52,7 @@ def clip_settings(env_id: str) -> dict[str, dict[str, Any]]:
         return {"other episodes": {"stop": "auto"}}
     if not has_clips(env_id):
         return {"held-out layouts": {}}
-    return {"clips of pretraining": {"split": "train", "recolour": False}, "unseen clips": {"split": "eval"}}
+    return {"clips of pretraining": {"split": "train", "color_jitter": False}, "unseen clips": {"split": "eval"}}
 
 
 def clips_of(samples: Samples) -> Backgrounds | None:
@@ -96,7 +96,7 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
     :param n_states: agents, each in a layout of its own
     :param seed: of the choices
     :return: per encoder and setting (:func:`clip_settings`), in units of the mean distance between two states on the
-        same background: ``map`` by offset [dy, dx] in metres from agent to obstacle, ``profile`` by distance
+        same background: ``map`` by offset [dy, dx] in meters from agent to obstacle, ``profile`` by distance
         (:data:`BINS`), ``agent``, and ``clip`` (None without clips)
     :raises ValueError: for an environment without pixels of this kind, or too few states
     """
@@ -104,7 +104,7 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
         raise ValueError(f"obstacles can be moved in {', '.join(ENV_IDS)}, got {env_id!r}")
     if n_states < 2:
         raise ValueError(f"distances between states need two states or more, got {n_states}")
-    encoders: dict[str, Any] = {name: {"digest": file.digest, "settings": {}} for name, file in files.items()}
+    encoders: dict[str, Any] = {name: {"hash": file.hash, "settings": {}} for name, file in files.items()}
     for setting, env_kwargs in clip_settings(env_id).items():
         samples = sample_episodes(env_id, n_states, 1, seed, env_kwargs)
         scenes = _scenes(samples, np.random.default_rng(seed))
@@ -153,9 +153,9 @@ def _l1(x: th.Tensor, y: th.Tensor) -> th.Tensor:
     return (x - y).abs().sum(dim=1)
 
 
-def _edge_distance(agents: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+def _edge_distance(agents: NDArray[np.float64], centers: NDArray[np.float64]) -> NDArray[np.float64]:
     """From a point to the nearest point of a square obstacle, 0 inside; shapes (n, 2) to (n,)."""
-    outside = np.maximum(np.abs(centres - agents) - _HALF, 0.0)
+    outside = np.maximum(np.abs(centers - agents) - _HALF, 0.0)
     return np.hypot(outside[:, 0], outside[:, 1])
 
 
@@ -200,7 +200,7 @@ def _nudged(
 
 
 def _offset_map(offsets: NDArray[np.float64], values: NDArray[Any]) -> NDArray[np.float64]:
-    """Mean by offset in bins of a metre, [dy, dx] from -MAP_REACH to MAP_REACH; NaN for rare offsets."""
+    """Mean by offset in bins of a meter, [dy, dx] from -MAP_REACH to MAP_REACH; NaN for rare offsets."""
     bins = np.rint(offsets).astype(np.int64) + MAP_REACH
     side = 2 * MAP_REACH + 1
     inside = ((bins >= 0) & (bins < side)).all(axis=1)

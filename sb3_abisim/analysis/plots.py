@@ -188,7 +188,7 @@ def draw_structures(results: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(2, n + 1, figsize=(2.9 * (n + 1), 6.0), constrained_layout=True, squeeze=False)
     kinds = np.select([structure == "#", structure == "?"], [0.0, 0.5], 1.0)
     axes[0, 0].imshow(kinds, cmap="gray", vmin=0, vmax=1)
-    axes[0, 0].set_title("reachable (white), walls (black),\nout of reach (grey)", fontsize=9)
+    axes[0, 0].set_title("reachable (white), walls (black),\nout of reach (gray)", fontsize=9)
     axes[1, 0].axis("off")
     for k, (name, result) in enumerate(encoders.items(), start=1):
         cells = as_array(result["cells"])

@@ -1,4 +1,4 @@
-"""More figures: pixel space, neighbours, probes, curves and the leak audit. Needs the extra ``plots``."""
+"""More figures: pixel space, neighbors, probes, curves and the leak audit. Needs the extra ``plots``."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
 
-N_COLOURS = 256
+N_COLORS = 256
 
 
 def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
@@ -27,7 +27,7 @@ def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
     for row, setting in zip(axes, settings, strict=True):
         here = {name: result["settings"][setting] for name, result in encoders.items()}
         for axis, (name, result) in zip(row, here.items(), strict=False):
-            image = show_map(axis, as_array(result["map"]), short_name(name), results["reach"], "metres")
+            image = show_map(axis, as_array(result["map"]), short_name(name), results["reach"], "meters")
         row[0].set_ylabel(setting)
         figure.colorbar(image, ax=list(row[:n]), shrink=0.8, label="relative to the largest")
         lines = {short_name(name): result["profile"] for name, result in here.items()}
@@ -40,7 +40,7 @@ def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
     figure.legend(handles, labels, loc="outside lower right", ncols=min(n, 6), fontsize=8)
     figure.suptitle(f"Change of the embedding when one obstacle moves by 1 m, {results['env_id']}", fontsize=10)
     save(figure, path)
-    _reduce_colours(path)
+    _reduce_colors(path)
 
 
 def _show_changes(axis: Any, here: dict[str, Any]) -> None:
@@ -57,10 +57,10 @@ def _show_changes(axis: Any, here: dict[str, Any]) -> None:
     axis.set_ylabel("change (1: another state)")
 
 
-def draw_neighbours(results: dict[str, Any], path: Path) -> None:
-    """Queries in the first row, each encoder's nearest neighbours below with their distances; settings side by side.
+def draw_neighbors(results: dict[str, Any], path: Path) -> None:
+    """Queries in the first row, each encoder's nearest neighbors below with their distances; settings side by side.
 
-    :param results: of :func:`~sb3_abisim.analysis.neighbors.neighbours`
+    :param results: of :func:`~sb3_abisim.analysis.neighbors.neighbors`
     :param path: the PNG
     """
     plt = pyplot()
@@ -87,19 +87,19 @@ def draw_neighbours(results: dict[str, Any], path: Path) -> None:
     gap = "\n" if len(pictures) == 1 else " "
     figure.suptitle(
         f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings,{gap}1 is the mean of "
-        f"all neighbours; {unit}: distance of the agents)",
+        f"all neighbors; {unit}: distance of the agents)",
         fontsize=8,
     )
     save(figure, path)
-    _reduce_colours(path)
+    _reduce_colors(path)
 
 
-def _reduce_colours(path: Path) -> None:
+def _reduce_colors(path: Path) -> None:
     """Photographs and many panels make large PNGs; with a palette they take a third of that."""
     from PIL import Image
 
     with Image.open(path) as picture:
-        small = picture.convert("RGB").quantize(N_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        small = picture.convert("RGB").quantize(N_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     small.save(path, optimize=True)
 
 

@@ -83,7 +83,7 @@ def targets(samples: Samples) -> dict[str, Target]:
 
 
 def make_probe(kind: str) -> Any:
-    """A scikit-learn regressor on standardised inputs.
+    """A scikit-learn regressor on standardized inputs.
 
     :param kind: one of :data:`PROBES`
     """
@@ -145,10 +145,10 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     pictures = next(iter(learn.values())).frames
     th.manual_seed(seed)
     encoders: dict[str, tuple[Encoder, dict[str, Any]]] = {
-        name: (file.encoder.eval(), {"digest": file.digest, **_origin(file)}) for name, file in files.items()
+        name: (file.encoder.eval(), {"hash": file.hash, **_origin(file)}) for name, file in files.items()
     }
     untrained = make_encoder(_space_of(pictures)).eval()
-    encoders[UNTRAINED] = (untrained, {"digest": None, "objective": UNTRAINED, "seed": seed})
+    encoders[UNTRAINED] = (untrained, {"hash": None, "objective": UNTRAINED, "seed": seed})
     results = {}
     for name, (encoder, origin) in encoders.items():
         scores = {setting: _scores(encoder, learn, test, setting) for setting in settings}
@@ -165,7 +165,7 @@ def _space_of(frames: NDArray[np.uint8]) -> Any:
 
 
 def _origin(file: EncoderFile) -> dict[str, Any]:
-    return {"objective": file.contract["objective"], "seed": file.contract["settings"].get("seed")}
+    return {"objective": file.metadata["objective"], "seed": file.metadata["settings"].get("seed")}
 
 
 def _scores(encoder: Encoder, learn: dict[str, Samples], test: dict[str, Samples], setting: str) -> dict[str, Any]:
@@ -216,8 +216,8 @@ def clip_shifts(encoder: Encoder, reference: Samples, samples: list[Samples]) ->
     :return: by name of the clip; empty without clips
     """
     features = embed(encoder, reference.frames)
-    centre = features.mean(dim=0)
-    unit = (features - centre).abs().sum(dim=1).mean()
+    center = features.mean(dim=0)
+    unit = (features - center).abs().sum(dim=1).mean()
     shifts = {}
     for one in samples:
         clips = clips_of(one)
@@ -226,7 +226,7 @@ def clip_shifts(encoder: Encoder, reference: Samples, samples: list[Samples]) ->
         features = embed(encoder, one.frames)
         shown = th.as_tensor(one.factors["clip"])
         for k in np.unique(one.factors["clip"]).tolist():
-            shifts[clips.names[k]] = float((features[shown == k].mean(dim=0) - centre).abs().sum() / unit)
+            shifts[clips.names[k]] = float((features[shown == k].mean(dim=0) - center).abs().sum() / unit)
     return shifts
 
 

@@ -16,7 +16,7 @@ from sb3_abisim.envs.point_maze.env import ROOM_SIZE
 from sb3_abisim.envs.point_maze.layout import (
     GOAL_MASK,
     OBSTACLE_PIXELS,
-    PIXELS_PER_METRE,
+    PIXELS_PER_METER,
     WALL_MASK,
     static_layer,
     to_pixels,
@@ -26,10 +26,10 @@ from sb3_abisim.envs.scan_nav.map import ScanMap
 
 # Copies collected at once; 64 x 64 pictures of a whole episode take 1.6 MB.
 N_COPIES = 50
-# Points around the agent, this many cells, metres or steps in each direction.
+# Points around the agent, this many cells, meters or steps in each direction.
 LOCAL_REACH = 2
 SCAN_STEP = 0.25  # m, ScanNav's step forward
-_HALF_OBSTACLE = OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
+_HALF_OBSTACLE = OBSTACLE_PIXELS / PIXELS_PER_METER / 2
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def sample_episodes(
 
 
 def position_in_picture(factors: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Where the agent is, (n, 2) in cells or metres; in ScanNav, whose camera hangs above the goal, from the goal.
+    """Where the agent is, (n, 2) in cells or meters; in ScanNav, whose camera hangs above the goal, from the goal.
 
     :param factors: of :class:`Samples`
     """
@@ -108,7 +108,7 @@ def position_in_picture(factors: dict[str, NDArray[Any]]) -> NDArray[np.float64]
 def local_obstacles(factors: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """Whether the points around the agent are blocked, by an obstacle or because they lie outside.
 
-    Points are a cell (Nav2D), a metre (the point mazes) or a step (the built-in flats of ScanNav) apart, up to
+    Points are a cell (Nav2D), a meter (the point mazes) or a step (the built-in flats of ScanNav) apart, up to
     :data:`LOCAL_REACH` in each direction.
 
     :param factors: of :class:`Samples`
@@ -133,13 +133,13 @@ def local_obstacles(factors: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
 
 
 def _blocked_in_flats(points: NDArray[Any], scenes: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether an agent's centre cannot be at (x, y) in m, (n, m, 2), of the flats (n,)."""
+    """Whether an agent's center cannot be at (x, y) in m, (n, m, 2), of the flats (n,)."""
     blocked = np.ones(points.shape[:2], dtype=bool)
     for k in np.unique(scenes).tolist():
         scan = ScanMap.apartment(SEEDS[k])
         here = scenes == k
-        column = np.floor((points[here, :, 0] - scan.origin[0]) / scan.metres_per_pixel).astype(np.int64)
-        row = np.floor((scan.origin[1] - points[here, :, 1]) / scan.metres_per_pixel).astype(np.int64)
+        column = np.floor((points[here, :, 0] - scan.origin[0]) / scan.meters_per_pixel).astype(np.int64)
+        row = np.floor((scan.origin[1] - points[here, :, 1]) / scan.meters_per_pixel).astype(np.int64)
         height, width = scan.walkable.shape
         inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
         walkable = scan.walkable[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
@@ -152,10 +152,10 @@ def draw_point_mazes(
 ) -> NDArray[np.uint8]:
     """Observations of the point mazes from simulator states, byte for byte those of the environments.
 
-    (Factors hold positions as float32; their rounding can change the agent's edge by two grey levels.)
+    (Factors hold positions as float32; their rounding can change the agent's edge by two gray levels.)
 
-    :param agents: (x, y) in metres, (n, 2)
-    :param obstacles: (x, y) of their centres in metres, on the pixel grid, (n, n_obstacles, 2)
+    :param agents: (x, y) in meters, (n, 2)
+    :param obstacles: (x, y) of their centers in meters, on the pixel grid, (n, n_obstacles, 2)
     :param backgrounds: what the floor shows, uint8 (n, 3, 64, 64); None for plain floor
     :return: uint8 (n, 3, 64, 64)
     """
@@ -165,11 +165,11 @@ def draw_point_mazes(
         for column, row in places:
             solid[row : row + OBSTACLE_PIXELS, column : column + OBSTACLE_PIXELS] = True
     pictures = np.array([static_layer(solid) for solid in solids])
-    painter = top_down.DiscPainter(top_down.AGENT_RADIUS * PIXELS_PER_METRE, top_down.IMAGE_SIZE)
-    centres = to_pixels(agents)
-    painter.draw(pictures, centres)
+    painter = top_down.DiscPainter(top_down.AGENT_RADIUS * PIXELS_PER_METER, top_down.IMAGE_SIZE)
+    centers = to_pixels(agents)
+    painter.draw(pictures, centers)
     if backgrounds is None:
         return pictures
     masks = solids | GOAL_MASK
-    painter.mark(masks, centres)
+    painter.mark(masks, centers)
     return composite(pictures, masks, backgrounds.copy())

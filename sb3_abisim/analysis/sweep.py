@@ -22,7 +22,7 @@ def sweep_encoders(
     :param n_updates: of each pretraining; None for the environment's own setting
     :raises ValueError: for missing encoders without data, data of another environment, or encoders of another base
     """
-    base_digest = load_encoder(base).digest
+    base_hash = load_encoder(base).hash
     files = {}
     for c in values:
         path = folder / f"abisim_c{c:g}.safetensors"
@@ -36,12 +36,12 @@ def sweep_encoders(
             config = load_config("abisim", env_id, {"objective_kwargs.c": c, **given})
             pretrain("abisim", data, path, config, base, device="cpu", verbose=0)
         files[c] = load_encoder(path)
-        found_c = files[c].contract["settings"]["objective_kwargs"].get("c")
+        found_c = files[c].metadata["settings"]["objective_kwargs"].get("c")
         if found_c != c:
             raise ValueError(f"{path} was trained with c = {found_c}, its name says {c:g}; rename or remove it")
-        if (found_base := files[c].contract["settings"]["base_digest"]) != base_digest:
+        if (found_base := files[c].metadata["settings"]["base_hash"]) != base_hash:
             raise ValueError(
                 f"{path} was trained on another base encoder than {base} (digests {found_base[:8]}, "
-                f"{base_digest[:8]}); give that one as --base, or remove the file"
+                f"{base_hash[:8]}); give that one as --base, or remove the file"
             )
     return files

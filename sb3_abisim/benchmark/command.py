@@ -11,8 +11,8 @@ from pathlib import Path
 
 from sb3_abisim.benchmark.export import INDEX_NAME, export
 from sb3_abisim.benchmark.jobs.job import is_by_other_code, is_done
-from sb3_abisim.benchmark.jobs.local import Engine, make_engine, run_cells
-from sb3_abisim.benchmark.plan import Cell, Plan, build, run_labels
+from sb3_abisim.benchmark.jobs.local import Engine, make_engine, run_jobs
+from sb3_abisim.benchmark.plan import Job, Plan, build, run_labels
 from sb3_abisim.common.cli import PROGRAM, make_parser, run
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.envs import ENV_IDS
@@ -25,14 +25,14 @@ DEFAULT_ENV_IDS = ("Nav2D-v0", "PointMaze-v0", "DistractorPointMaze-v0")
 def main(argv: Sequence[str] | None = None) -> None:
     """The command; see ``--help``.
 
-    Exits with 2 for mistakes in the arguments, 1 if a cell failed, 130 after Ctrl-C.
+    Exits with 2 for mistakes in the arguments, 1 if a job failed, 130 after Ctrl-C.
 
     :param argv: its words; the program's arguments by default
     """
     words = sys.argv[1:] if argv is None else list(argv)
     command, rest = (words[0], words[1:]) if words and words[0] in COMMANDS else ("run", words)
     parser, function = COMMANDS[command]
-    run(parser(), rest, function, "stopped; the same command goes on with the cells that are missing")
+    run(parser(), rest, function, "stopped; the same command goes on with the jobs that are missing")
 
 
 def _run_parser() -> argparse.ArgumentParser:
@@ -53,7 +53,7 @@ def _run_parser() -> argparse.ArgumentParser:
     _add_budget(parser)
     parser.add_argument("--final-episodes", type=int, default=100,
                         help="of the final model on each split, 0 for none (default: 100)")  # fmt: skip
-    parser.add_argument("--dry-run", action="store_true", help="list the cells and their commands, and stop")
+    parser.add_argument("--dry-run", action="store_true", help="list the jobs and their commands, and stop")
     parser.add_argument("--no-report", action="store_true", help="do not draw the report at the end")
     return parser
 
@@ -76,11 +76,11 @@ def _add_budget(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pretrain-params", nargs="+", default=[], metavar="[OBJECTIVE.]NAME:VALUE",
                         help="settings of pretraining, such as abisim.objective_kwargs.c:0.9")  # fmt: skip
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--threads", type=int, default=1, help="of each cell (default: 1)")
-    parser.add_argument("--jobs", type=int, help="cells at a time (default: as the processors allow)")
+    parser.add_argument("--threads", type=int, default=1, help="of each job (default: 1)")
+    parser.add_argument("--jobs", type=int, help="jobs at a time (default: as the processors allow)")
     parser.add_argument("--engine", default="local", choices=("local", "ray"))
     parser.add_argument("--address", default="auto", help="of the Ray cluster (default: auto)")
-    parser.add_argument("--gpus", type=float, default=0.0, help="per cell, on Ray (default: 0)")
+    parser.add_argument("--gpus", type=float, default=0.0, help="per job, on Ray (default: 0)")
     parser.add_argument("--retries", type=int, default=3, help="after a lost worker, on Ray (default: 3)")
 
 
@@ -102,30 +102,30 @@ def _engine(args: argparse.Namespace) -> Engine:
 
 def _run(args: argparse.Namespace) -> None:
     plan = _plan(args, args.methods, args.env, args.final_episodes)
-    cells, root = build(plan), Path(args.output)
+    jobs, root = build(plan), Path(args.output)
     if args.dry_run:
-        _list(root, cells)
+        _list(root, jobs)
         return
     if not args.no_report:
         _require_report()
-    errors = run_cells(root, cells, _engine(args))
-    labels = run_labels(cells)
-    runs = [{"folder": cell.output, "label": labels[cell.name]} for cell in cells if cell.kind == "run"]
+    errors = run_jobs(root, jobs, _engine(args))
+    labels = run_labels(jobs)
+    runs = [{"folder": job.output, "label": labels[job.name]} for job in jobs if job.kind == "run"]
     index = {"plan": dataclasses.asdict(plan), "runs": runs}
     write_atomic(root / INDEX_NAME, lambda file: file.write(json.dumps(index, indent=1).encode()))
     if errors:
-        print(f"{len(errors)} cells failed: {', '.join(errors)}; their logs are in {root / 'logs'}", file=sys.stderr)
+        print(f"{len(errors)} jobs failed: {', '.join(errors)}; their logs are in {root / 'logs'}", file=sys.stderr)
         sys.exit(1)
     if not args.no_report:
         _report(_report_parser().parse_args([str(root)]))
 
 
-def _list(root: Path, cells: list[Cell]) -> None:
-    for cell in cells:
-        state = "done" if is_done(root, cell.to_json()) else "missing"
-        if state == "done" and is_by_other_code(root, cell.to_json()):
+def _list(root: Path, jobs: list[Job]) -> None:
+    for job in jobs:
+        state = "done" if is_done(root, job.to_json()) else "missing"
+        if state == "done" and is_by_other_code(root, job.to_json()):
             state = "other code"
-        print(f"{state:11}{cell.name}  {cell.title}\n           python -m {' '.join(cell.command)}")
+        print(f"{state:11}{job.name}  {job.title}\n           python -m {' '.join(job.command)}")
 
 
 def _require_report() -> None:
@@ -147,7 +147,7 @@ def _report_parser() -> argparse.ArgumentParser:
                         help="learning curves from the zoo's evaluations or from the training episodes")  # fmt: skip
     parser.add_argument("--reference", help="the method that the others are compared with (default: abisim)")
     parser.add_argument("--thresholds", nargs="+", type=_threshold, metavar="NUMBER|METHOD",
-                        help="normalised returns, 0 (never at the goal) to 1, or methods, whose last return is meant "
+                        help="normalized returns, 0 (never at the goal) to 1, or methods, whose last return is meant "
                         "(default: 0.5 0.7 0.9, and vanilla if it is there)")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
     return parser

@@ -1,4 +1,4 @@
-"""Copy of a benchmark that is small enough to commit: what the report reads, and how each cell was made.
+"""Copy of a benchmark that is small enough to commit: what the report reads, and how each job was made.
 
 Models, datasets, encoders and monitor files stay behind, and so do the names of the folders that they lay in. Of the
 training episodes the curve stays.
@@ -45,7 +45,7 @@ def export(folder: str | Path, output: str | Path) -> Path:
     try:
         for run in runs:
             _copy_run(run, folder, part / run.folder.relative_to(folder))
-        _copy_markers(runs, folder, part)
+        _copy_manifests(runs, folder, part)
         index = json.loads((folder / INDEX_NAME).read_bytes()) if (folder / INDEX_NAME).is_file() else {}
         index["runs"] = [{"folder": run.folder.relative_to(folder).as_posix(), "label": run.label} for run in runs]
         _write(part / INDEX_NAME, without_folders(json.dumps(index, indent=1, ensure_ascii=False), folder))
@@ -91,19 +91,19 @@ def _copy_run(run: Run, root: Path, target: Path) -> None:
     )
 
 
-def _copy_markers(runs: list[Run], root: Path, target: Path) -> None:
+def _copy_manifests(runs: list[Run], root: Path, target: Path) -> None:
     """How the runs, and what they rest on, were made: by which command, with which versions, on what, for how long."""
-    markers: dict[str, dict[str, Any]] = {}
-    for path in sorted((root / "cells").glob("*.json")):
-        markers[path.stem] = json.loads(path.read_bytes())
+    manifests: dict[str, dict[str, Any]] = {}
+    for path in sorted((root / "jobs").glob("*.json")):
+        manifests[path.stem] = json.loads(path.read_bytes())
     outputs = {run.folder.relative_to(root).as_posix() for run in runs}
-    names = [name for name, marker in markers.items() if marker["output"] in outputs]
+    names = [name for name, manifest in manifests.items() if manifest["output"] in outputs]
     for name in names:  # grows while it is walked
-        names += [source for source in markers[name]["inputs"] if source in markers and source not in names]
+        names += [source for source in manifests[name]["inputs"] if source in manifests and source not in names]
     for name in names:
         # The name of a machine says nothing elsewhere.
-        kept = {key: value for key, value in markers[name].items() if key != "host"}
-        _write(target / "cells" / f"{name}.json", without_folders(json.dumps(kept, indent=1, ensure_ascii=False), root))
+        kept = {key: value for key, value in manifests[name].items() if key != "host"}
+        _write(target / "jobs" / f"{name}.json", without_folders(json.dumps(kept, indent=1, ensure_ascii=False), root))
 
 
 def _write_arrays(path: Path, arrays: dict[str, NDArray[Any]]) -> None:

@@ -1,8 +1,8 @@
-"""The cells of a benchmark: what there is to collect, pretrain, train and evaluate, each named by what determines it.
+"""The jobs of a benchmark: what there is to collect, pretrain, train and evaluate, each named by what determines it.
 
-A cell's key is a hash over its kind, the package's version, its settings and the keys of its inputs. Two benchmarks
+A job's key is a hash over its kind, the package's version, its settings and the keys of its inputs. Two benchmarks
 that need the same dataset therefore find the same folder, and a changed setting gives new names to what depends on it
-and to nothing else. Changes of code without a change of version do not change the names; the cells' markers tell them
+and to nothing else. Changes of code without a change of version do not change the names; the jobs' manifests tell them
 (:mod:`sb3_abisim.benchmark.jobs.source_hash`).
 """
 
@@ -40,28 +40,28 @@ PAPER_EVAL_FREQ = 16_384
 
 
 @dataclasses.dataclass(frozen=True)
-class Cell:
+class Job:
     """One command whose output depends on its settings and inputs alone.
 
     :param kind: "data", "encoder", "run" or "final"
     :param title: what the display calls it
     :param settings: all that determines the output besides the inputs; JSON types
-    :param inputs: cells that must be done first
+    :param inputs: jobs that must be done first
     :param command: words after ``python -m``, to be run in the benchmark's folder
     :param output: what it makes, relative to the benchmark's folder
-    :param proof: a file of the output whose digest is kept; "" for the output itself
-    :param units: transitions, updates, steps or episodes, whichever it counts in
+    :param output_file: a file of the output whose digest is kept; "" for the output itself
+    :param cost: transitions, updates, steps or episodes, whichever it counts in
     :param method: of a run, the plan's word that asked for it
     """
 
     kind: str
     title: str
     settings: dict[str, Any]
-    inputs: tuple["Cell", ...]
+    inputs: tuple["Job", ...]
     command: tuple[str, ...]
     output: str
-    proof: str = ""
-    units: int = 1
+    output_file: str = ""
+    cost: int = 1
     method: str = ""
 
     @property
@@ -77,7 +77,7 @@ class Cell:
     def to_json(self) -> dict[str, Any]:
         """The fields and the key, in JSON types; inputs by name."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return {**fields, "name": self.name, "inputs": [cell.name for cell in self.inputs]}
+        return {**fields, "name": self.name, "inputs": [job.name for job in self.inputs]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,8 +99,8 @@ class Plan:
     :param params: more of rl-zoo3's ``-params``, ``name:value``, or ``algo.name:value`` for one algorithm
     :param pretrain_params: settings of pretraining, ``name:value``, or ``objective.name:value`` for one objective
     :param device: of pretraining and RL
-    :param threads: of each cell
-    :param packages: modules that register environments and methods, imported by each cell
+    :param threads: of each job
+    :param packages: modules that register environments and methods, imported by each job
     :raises ValueError: for what does not fit together
     """
 
@@ -147,18 +147,18 @@ class Plan:
                 raise ValueError(f"settings are given as name:value, got {word!r}")
 
 
-def build(plan: Plan) -> list[Cell]:
-    """All cells of a plan, each once, inputs before what needs them.
+def build(plan: Plan) -> list[Job]:
+    """All jobs of a plan, each once, inputs before what needs them.
 
     :param plan: what to compare
     :raises ValueError: for an unknown method or setting, or an environment without hyperparameters
     """
-    cells: dict[str, Cell] = {}
+    jobs: dict[str, Job] = {}
 
-    def add(cell: Cell) -> None:
-        for source in cell.inputs:
+    def add(job: Job) -> None:
+        for source in job.inputs:
             add(source)
-        cells.setdefault(cell.name, cell)
+        jobs.setdefault(job.name, job)
 
     # Seeds outermost: a benchmark that is stopped early has whole comparisons with fewer seeds.
     for i, seed in enumerate(plan.seeds):
@@ -166,55 +166,55 @@ def build(plan: Plan) -> list[Cell]:
             for method in plan.methods:
                 encoder_seed = plan.encoder_seeds[i % len(plan.encoder_seeds)]
                 named = MethodSpec.parse(method.replace("{seed}", str(encoder_seed)))
-                run = dataclasses.replace(run_cell(plan, env_id, named, seed, encoder_seed), method=method)
-                add(final_cell(plan, run) if plan.final_episodes else run)
-    _check_owners(plan, list(cells.values()))
-    return list(cells.values())
+                run = dataclasses.replace(run_job(plan, env_id, named, seed, encoder_seed), method=method)
+                add(final_job(plan, run) if plan.final_episodes else run)
+    _check_owners(plan, list(jobs.values()))
+    return list(jobs.values())
 
 
-def _check_owners(plan: Plan, cells: list[Cell]) -> None:
-    """Refuse settings for an algorithm or objective that no cell has."""
+def _check_owners(plan: Plan, jobs: list[Job]) -> None:
+    """Refuse settings for an algorithm or objective that no job has."""
     for option, words, field, owners in (
         ("--params", plan.params, "algo", ALGOS),
         ("--pretrain-params", plan.pretrain_params, "objective", tuple(methods())),
     ):
-        used = {cell.settings[field] for cell in cells if field in cell.settings}
+        used = {job.settings[field] for job in jobs if field in job.settings}
         for word in words:
             head, dot, _ = word.partition(".")
             if dot and head in owners and head not in used:
                 raise ValueError(f"{option} {word} is for {head}, but here is only {', '.join(sorted(used)) or 'none'}")
     for word in plan.params:
-        if re.match(r"(\w+\.)?env_kwargs:", word) and any(cell.kind == "data" for cell in cells):
+        if re.match(r"(\w+\.)?env_kwargs:", word) and any(job.kind == "data" for job in jobs):
             raise ValueError(
                 f"--params {word} would hold for RL, but not for the data that encoders are pretrained on; collect and "
                 "pretrain with the same arguments yourself, and give the files: METHOD=FILE"
             )
 
 
-def data_cell(plan: Plan, env_id: str) -> Cell:
+def data_job(plan: Plan, env_id: str) -> Job:
     """The dataset of an environment."""
     traits = get_traits(env_id)
     n, env_kwargs = plan.n_transitions or traits.n_transitions, dict(traits.collect_kwargs)
     settings: dict[str, Any] = {"env_id": env_id, "n_transitions": n, "seed": 0}
-    # Only where there are any, so that the names of the other environments' cells stay.
+    # Only where there are any, so that the names of the other environments' jobs stay.
     settings |= {"env_kwargs": env_kwargs} if env_kwargs else {}
     output = f"data/{env_id}-{_key('data', settings)[:8]}"
     command = ["sb3_abisim", "collect", "--env", env_id, "-n", str(n), "-o", output]
     command += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in env_kwargs.items())] if env_kwargs else []
     command += _packages(plan)
-    return Cell("data", f"collect {env_id}", settings, (), tuple(command), output, "meta.json", n)
+    return Job("data", f"collect {env_id}", settings, (), tuple(command), output, "meta.json", n)
 
 
-def encoder_cell(plan: Plan, env_id: str, objective: str, seed: int) -> Cell:
+def encoder_job(plan: Plan, env_id: str, objective: str, seed: int) -> Job:
     """An encoder; one that builds on another method's starts from that one's with the same seed.
 
     :param objective: name of a method that has one
     """
     objective_class = get_objective(objective)
     base = get_method(objective).base
-    inputs: tuple[Cell, ...] = (data_cell(plan, env_id),)
+    inputs: tuple[Job, ...] = (data_job(plan, env_id),)
     if base is not None:
-        inputs += (encoder_cell(plan, env_id, base, seed),)
+        inputs += (encoder_job(plan, env_id, base, seed),)
     words = _params_of(plan.pretrain_params, objective, tuple(methods()))
     config = load_config(objective, env_id, parse_pairs(words, "--pretrain-params"))
     settable = inspect.signature(objective_class).parameters.keys() - FOLLOWING
@@ -231,10 +231,10 @@ def encoder_cell(plan: Plan, env_id: str, objective: str, seed: int) -> Cell:
     command += ["-params", *words] if words else []
     command += _packages(plan)
     title = f"pretrain {objective} {env_id} seed {seed}"
-    return Cell("encoder", title, settings, inputs, tuple(command), output, units=config.n_updates)
+    return Job("encoder", title, settings, inputs, tuple(command), output, cost=config.n_updates)
 
 
-def run_cell(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed: int) -> Cell:
+def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed: int) -> Job:
     """A zoo run; its folder lies where ``rl_zoo3.plots`` looks for it.
 
     :param method: which features extractor
@@ -255,17 +255,17 @@ def run_cell(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_see
         )
     n = plan.n_timesteps or int(entry["n_timesteps"])
     eval_freq = plan.eval_freq or min(PAPER_EVAL_FREQ, max(n // 100, 1))
-    inputs: tuple[Cell, ...] = ()
+    inputs: tuple[Job, ...] = ()
     settings = {"env_id": env_id, "algo": algo, "seed": seed, "method": method.name, "frozen": method.frozen}
     conf_file, label = method.name, method.name
     if method.encoder is not None:
         file = load_encoder(method.encoder)
-        settings["encoder_digest"] = file.digest
-        label += f"-{file.digest[:6]}"
+        settings["encoder_digest"] = file.hash
+        label += f"-{file.hash[:6]}"
         path = Path(method.encoder)
         conf_file += f"={path.resolve() if path.is_file() else method.encoder}"
     elif get_method(method.name).is_pretrained:
-        inputs = (encoder_cell(plan, env_id, method.name, encoder_seed),)
+        inputs = (encoder_job(plan, env_id, method.name, encoder_seed),)
         conf_file += f"={inputs[0].output}"
     settings |= {
         "hyperparams": {**entry, "n_timesteps": n, **given},
@@ -284,7 +284,7 @@ def run_cell(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_see
     command += _packages(plan)
     output = f"{family}/{algo}/{env_id}_{int(key[:10], 16)}"
     title = f"{algo} {method.name}{frozen} {env_id} seed {seed}"
-    return Cell("run", title, settings, inputs, tuple(command), output, f"{env_id}.zip", n)
+    return Job("run", title, settings, inputs, tuple(command), output, f"{env_id}.zip", n)
 
 
 def _check_params(algo: str, names: Collection[str]) -> None:
@@ -298,13 +298,13 @@ def _check_params(algo: str, names: Collection[str]) -> None:
             raise ValueError(f"{algo} has no hyperparameter {name!r}, only {', '.join(sorted(known))}")
 
 
-def run_labels(cells: list[Cell]) -> dict[str, str]:
+def run_labels(jobs: list[Job]) -> dict[str, str]:
     """What a report calls the runs: their method, and the end of the encoder's path where a method is given several.
 
-    :param cells: what :func:`build` made
-    :return: name of each run's cell to its label
+    :param jobs: what :func:`build` made
+    :return: name of each run's job to its label
     """
-    runs = [cell for cell in cells if cell.kind == "run"]
+    runs = [job for job in jobs if job.kind == "run"]
     labels = dict.fromkeys((run.method for run in runs), "")
     for word in labels:
         method = MethodSpec.parse(word)
@@ -324,22 +324,22 @@ def _parts(encoder: str) -> tuple[str, ...]:
     return Path(re.sub(r"[-_.]?\{seed\}", "", encoder.removesuffix(".safetensors"))).parts
 
 
-def final_cell(plan: Plan, run: Cell) -> Cell:
+def final_job(plan: Plan, run: Job) -> Job:
     """The evaluation of a run's final model: on each split of the distractors, where there are any."""
     splits = get_traits(run.settings["env_id"]).splits
     settings = {"n_episodes": plan.final_episodes, "splits": list(splits)}
     command = ["sb3_abisim", "benchmark", "evaluate", run.output, "--episodes", str(plan.final_episodes)]
     command += _packages(plan)
-    units = plan.final_episodes * max(1, len(splits))
+    cost = plan.final_episodes * max(1, len(splits))
     title = run.title.replace(" ", " final ", 1)
-    return Cell("final", title, settings, (run,), tuple(command), run.output, "final_evaluations.npz", units)
+    return Job("final", title, settings, (run,), tuple(command), run.output, "final_evaluations.npz", cost)
 
 
-def _key(kind: str, settings: dict[str, Any], inputs: tuple[Cell, ...] = (), family: bool = False) -> str:
-    """The hash of all that determines a cell; with ``family``, of all but seeds."""
+def _key(kind: str, settings: dict[str, Any], inputs: tuple[Job, ...] = (), family: bool = False) -> str:
+    """The hash of all that determines a job; with ``family``, of all but seeds."""
     if family:
         settings = {name: value for name, value in settings.items() if name != "seed"}
-    sources = [_key(cell.kind, cell.settings, cell.inputs, family) for cell in inputs]
+    sources = [_key(job.kind, job.settings, job.inputs, family) for job in inputs]
     content = {"kind": kind, "version": __version__, "settings": settings, "inputs": sources}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

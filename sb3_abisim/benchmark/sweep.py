@@ -1,8 +1,8 @@
 """Search pretraining settings by what they do for the agents that are trained on the encoders.
 
-Optuna proposes, the cells of a benchmark answer: a trial is an encoder per encoder seed and a run per RL seed. Nothing
-is kept besides the cells. The sampler is seeded, so that the same command proposes the same trials again, finds those
-that are done by the names of their cells, and goes on where it was stopped (with the same version of Optuna, whose
+Optuna proposes, the jobs of a benchmark answer: a trial is an encoder per encoder seed and a run per RL seed. Nothing
+is kept besides the jobs. The sampler is seeded, so that the same command proposes the same trials again, finds those
+that are done by the names of their jobs, and goes on where it was stopped (with the same version of Optuna, whose
 sampler decides).
 """
 
@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sb3_abisim.benchmark.jobs.job import is_done
-from sb3_abisim.benchmark.jobs.local import Engine, run_cells
-from sb3_abisim.benchmark.plan import Cell, Plan, build
+from sb3_abisim.benchmark.jobs.local import Engine, run_jobs
+from sb3_abisim.benchmark.plan import Job, Plan, build
 from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_objective, methods
@@ -38,7 +38,7 @@ class Trial:
     """A proposal and what came of it.
 
     :param params: setting, with its objective in front, to value
-    :param returns: metric of each RL seed; empty if a cell failed
+    :param returns: metric of each RL seed; empty if a job failed
     :param encoders: files, relative to the sweep's folder
     """
 
@@ -49,7 +49,7 @@ class Trial:
 
     @property
     def value(self) -> float:
-        """Mean over the RL seeds; NaN if a cell failed."""
+        """Mean over the RL seeds; NaN if a job failed."""
         return sum(self.returns) / len(self.returns) if self.returns else math.nan
 
     @property
@@ -145,9 +145,9 @@ def sweep(
         graphs = [build(each) for each in plans]
         for trial in proposals:
             print(f"trial {trial.number + 1} of {n_trials}: {' '.join(trial.words)}", file=sys.stderr)
-        # Equal trials share their cells.
-        cells = {cell.name: cell for graph in graphs for cell in graph}
-        run_cells(root, list(cells.values()), make_engine())
+        # Equal trials share their jobs.
+        jobs = {job.name: job for graph in graphs for job in graph}
+        run_jobs(root, list(jobs.values()), make_engine())
         for optuna_trial, trial, graph in zip(asked, proposals, graphs, strict=True):
             trials.append(_answered(root, trial, graph, metric))
             value = trials[-1].value
@@ -171,8 +171,8 @@ def best_of(trials: Sequence[Trial]) -> Trial | None:
     return max((trial for trial in trials if trial.returns), key=lambda trial: trial.value, default=None)
 
 
-def _answered(root: Path, trial: Trial, cells: list[Cell], metric: str) -> Trial:
-    runs = [cell for cell in cells if cell.kind == "run"]
+def _answered(root: Path, trial: Trial, jobs: list[Job], metric: str) -> Trial:
+    runs = [job for job in jobs if job.kind == "run"]
     encoders = tuple(dict.fromkeys(run.inputs[0].output for run in runs))
     if not all(is_done(root, run.to_json()) for run in runs):
         return dataclasses.replace(trial, encoders=encoders)

@@ -1,8 +1,8 @@
 """Files that are either whole or absent, and folders with one writer at a time.
 
 A process may be killed between any two instructions. :func:`write_atomic` therefore writes under a temporary name and
-renames at the end; a reader sees the old file or the new one. :func:`folder_lock` rests on ``flock``, which the kernel
-releases when its holder dies, so that a kill leaves nothing to clean up by hand.
+renames at the end; a reader sees the old file or the new one. :func:`folder_lock` is a lock of the system, which lets go
+of it when its holder dies, so that a kill leaves nothing to clean up by hand.
 """
 
 import contextlib
@@ -14,6 +14,8 @@ import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
+
+from filelock import FileLock, Timeout
 
 LOCK_NAME = ".lock"
 _TEMPORARY_SUFFIX = ".tmp"
@@ -87,49 +89,42 @@ def remove_temporaries(folder: str | os.PathLike[str]) -> None:
 def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
     """Hold the right to write in a folder for the duration of a ``with`` block.
 
-    The lock file ``.lock`` is removed at the end; one left by a killed process is taken over.
+    The lock file ``.lock`` is removed at the end; one left by a killed process is taken over, since the system lets go
+    of a dead process's lock.
 
     :param path: an existing folder
     :raises FolderLockedError: at once, if another process (or another block of this one) holds the lock
     """
-    try:
-        import fcntl
-    except ImportError as error:
-        raise ImportError("writing in a folder that others may write in needs Linux or macOS (or WSL)") from error
     folder = Path(path)
     lock_path = folder / LOCK_NAME
+    lock = FileLock(lock_path, thread_local=False)
     while True:
-        descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.pread(descriptor, 1000, 0).decode(errors="replace") or "another process"
-            os.close(descriptor)
-            raise FolderLockedError(
-                f"{folder} is being written by {holder}; wait for it to end, stop it, or choose another folder"
-            ) from None
-        # A holder removes the file when it ends: what was just locked may no longer be what the name stands for.
-        if _is_same_file(descriptor, lock_path):
+            lock.acquire(blocking=False)
             break
-        os.close(descriptor)
+        except Timeout:
+            # A holder removes the file when it ends: what could not be locked may no longer be what the name stands for.
+            if not lock_path.exists():
+                continue
+        try:
+            holder = lock_path.read_text(errors="replace") or "another process"
+        except OSError:
+            holder = "another process"
+        raise FolderLockedError(
+            f"{folder} is being written by {holder}; wait for it to end, stop it, or choose another folder"
+        )
     try:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()} on host {socket.gethostname()}".encode(), 0)
+        # Windows lets nobody write in, or remove, a file that is locked.
+        with contextlib.suppress(PermissionError):
+            lock_path.write_text(f"process {os.getpid()} on host {socket.gethostname()}")
         yield
     finally:
-        lock_path.unlink(missing_ok=True)
-        os.close(descriptor)
+        with contextlib.suppress(PermissionError):
+            lock_path.unlink(missing_ok=True)
+        lock.release()
 
 
-def _is_same_file(descriptor: int, path: Path) -> bool:
-    try:
-        there = os.stat(path)
-    except FileNotFoundError:
-        return False
-    return os.path.samestat(os.fstat(descriptor), there)
-
-
-def file_digest(path: str | os.PathLike[str]) -> str:
+def file_hash(path: str | os.PathLike[str]) -> str:
     """The sha256 of a file's content in hexadecimal.
 
     :param path: the file

@@ -4,6 +4,8 @@ import os
 from pathlib import Path
 from typing import Literal
 
+import platformdirs
+
 CACHE_VARIABLE = "SB3_ABISIM_CACHE"
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -31,4 +33,4 @@ def cache_folder(kind: str = "") -> Path:
     chosen = os.environ.get(CACHE_VARIABLE)
     if chosen:
         return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "sb3_abisim" / kind
+    return platformdirs.user_cache_path("sb3_abisim", appauthor=False) / kind

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from sb3_abisim.common.cli import make_parser, parse_pairs, run
 from sb3_abisim.common.spaces import space_to_json
 from sb3_abisim.data.format import (
+    CONTENT_HASH_KEY,
     CUT,
     DRAWN_FORMAT_VERSION,
     FORMAT_VERSION,
@@ -102,7 +103,7 @@ def _collect(
         "observation_space": space_to_json(observation_space),
         "action_space": space_to_json(action_space),
         "factors": describe_factors(_factors(env)),
-        "fingerprint": _fingerprint(env),
+        CONTENT_HASH_KEY: _content_hash(env),
         "policy": "uniform",
         "seed": seed,
         "n_envs": env.num_envs,
@@ -130,11 +131,11 @@ def _collect(
             shard_seed = np.random.SeedSequence(seed, spawn_key=(k,))
             writer.write_shard(k, collect_shard(env, steps, size, shard_seed, bar.update))
             written += 1
-        digest = writer.finish(n_shards)
+        hash = writer.finish(n_shards)
     if progress:
         state = "already complete, nothing to do" if was_finished and not written else "complete"
-        print(f"{folder}: {n_transitions} transitions of {env_id}, {state} (digest {digest[:16]})")
-    return digest
+        print(f"{folder}: {n_transitions} transitions of {env_id}, {state} (digest {hash[:16]})")
+    return hash
 
 
 def collect_shard(
@@ -231,9 +232,9 @@ def _draws_factors(env: VectorEnv[Any, Any, Any]) -> bool:
     return isinstance(unwrapped, BatchEnv) and unwrapped.draws_factors
 
 
-def _fingerprint(env: VectorEnv[Any, Any, Any]) -> str | None:
+def _content_hash(env: VectorEnv[Any, Any, Any]) -> str | None:
     copies = getattr(env.unwrapped, "envs", None)
-    value = getattr(copies[0].unwrapped if copies else env.unwrapped, "fingerprint", None)
+    value = getattr(copies[0].unwrapped if copies else env.unwrapped, "content_hash", None)
     return None if value is None else str(value)
 
 

@@ -28,8 +28,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _command(args: argparse.Namespace) -> None:
     if args.command == "import":
-        digest = get_reader(args.reader).read_fn(args.source, args.output)
-        print(f"{args.output}: imported from {args.source} (digest {digest[:16]}); rewards were dropped")
+        hash = get_reader(args.reader).read_fn(args.source, args.output)
+        print(f"{args.output}: imported from {args.source} (digest {hash[:16]}); rewards were dropped")
         return
     from sb3_abisim.data.readers.minari import export_dataset
 

@@ -8,7 +8,6 @@ import mmap
 import os
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,11 +15,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_abisim.common.files import file_digest
+from sb3_abisim.common.files import file_hash
 from sb3_abisim.common.spaces import space_from_json
+from sb3_abisim.common.transitions import TransitionBatch
+from sb3_abisim.common.vocabulary import current_env_kwargs
 from sb3_abisim.data.format import (
     CONFIG_NAME,
     CUT,
+    HASH_KEY,
     INSIDE,
     META_NAME,
     DatasetError,
@@ -37,43 +39,15 @@ VERIFY_BELOW_BYTES = 4 * 10**9
 MAX_OPEN_FILES = 200
 # Files whose hash this process has found right: (path, size, time of the last change, sha256).
 _VERIFIED: set[tuple[str, int, int, str]] = set()
-# Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbours with it, so
+# Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbors with it, so
 # that up to twenty times as much was resident meanwhile. Pages stay in its cache: reading them again is cheap.
 RELEASE_AFTER_BYTES = 16 * 2**20
 # Which segments are held out is a property of the dataset, not of a run.
-_HOLDOUT_SEED = 20240229
+_SPLIT_SEED = 20240229
 
-Part = Literal["train", "test"]
+Split = Literal["train", "eval"]
 # Steps between two observations: a number, or the fewest and the most of them.
 Steps = int | tuple[int, int] | list[int]
-
-
-@dataclass(frozen=True)
-class TransitionBatch:
-    """B transitions in shuffled order.
-
-    :param frames: uint8 [m, C, H, W], in 0..255; those that several transitions share stand once
-    :param actions: a_t, int64 [B] or float32 [B, A]; as sequences a_t to a_{t+k-1}, int64 [B, k] or float32 [B, k, A]
-    :param now: where s_t stands among the frames, int64 [B] or a slice
-    :param later: where s_{t+k} stands among them
-    """
-
-    frames: NDArray[np.uint8]
-    actions: NDArray[Any]
-    now: NDArray[np.int64] | slice
-    later: NDArray[np.int64] | slice
-
-    @property
-    def observations(self) -> NDArray[np.uint8]:
-        """s_t, uint8 [B, C, H, W], in 0..255."""
-        rows: NDArray[np.uint8] = self.frames[self.now]
-        return rows
-
-    @property
-    def next_observations(self) -> NDArray[np.uint8]:
-        """s_{t+k}, uint8 [B, C, H, W]."""
-        rows: NDArray[np.uint8] = self.frames[self.later]
-        return rows
 
 
 class TransitionDataset:
@@ -82,22 +56,22 @@ class TransitionDataset:
     A frame index counts the frames of all shards, in order. Pickling (for worker processes) sends the path only.
 
     :param path: the folder
-    :param holdout: share of the segments (episodes and cut episodes) that make up ``part="test"``, in [0, 1)
+    :param eval_fraction: share of the segments (episodes and cut episodes) that make up ``split="eval"``, in [0, 1)
     :param verify: True compares every file with its sha256, False only sizes; None does so once per process for
         datasets below ``VERIFY_BELOW_BYTES``
     :raises DatasetError: if the folder is not a finished dataset, or is damaged, or has no frames and the scenes that
         they would be drawn from are not the same any more
     """
 
-    def __init__(self, path: str | os.PathLike[str], holdout: float = 0.05, verify: bool | None = None) -> None:
-        if not 0 <= holdout < 1:
-            raise ValueError(f"holdout must be in [0, 1), got {holdout}")
+    def __init__(self, path: str | os.PathLike[str], eval_fraction: float = 0.05, verify: bool | None = None) -> None:
+        if not 0 <= eval_fraction < 1:
+            raise ValueError(f"eval_fraction must be in [0, 1), got {eval_fraction}")
         self.path = Path(path)
-        self.holdout = holdout
+        self.eval_fraction = eval_fraction
         self.meta = _read_meta(self.path)
-        self.digest: str = self.meta["digest"]
+        self.hash: str = self.meta[HASH_KEY]
         self.env_id: str = self.meta["env_id"]
-        self.env_kwargs: dict[str, Any] = self.meta["env_kwargs"]
+        self.env_kwargs = current_env_kwargs(self.meta["env_kwargs"])
         self.n_transitions: int = self.meta["n_transitions"]
         self.n_frames: int = self.meta["n_frames"]
         self.observation_space: spaces.Box = space_from_json(self.meta["observation_space"])  # type: ignore[assignment]
@@ -122,54 +96,54 @@ class TransitionDataset:
         self._remaining = self._make_remaining()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.path, self.holdout, False)
+        return type(self), (self.path, self.eval_fraction, False)
 
     @property
     def ends(self) -> NDArray[np.uint8]:
         """Per frame: 0 within a segment, and on its last frame 1 terminated, 2 truncated, 3 cut by a shard's end."""
         return self._ends.copy()
 
-    def valid_starts(self, k: int = 1, part: Part | None = None) -> NDArray[np.int64]:
+    def valid_starts(self, k: int = 1, split: Split | None = None) -> NDArray[np.int64]:
         """The frames t for which frame t + k belongs to the same episode, ascending.
 
         :param k: steps, at least 1
-        :param part: "test" for the held-out segments, "train" for the others, None for all
+        :param split: "eval" for the segments that are only evaluated on, "train" for the others, None for all
         :raises ValueError: if there is none
         """
         if k < 1:
             raise ValueError(f"k must be at least 1, got {k}")
-        if part not in (None, "train", "test"):
-            raise ValueError(f"part must be 'train', 'test' or None, got {part!r}")
+        if split not in (None, "train", "eval"):
+            raise ValueError(f"split must be 'train', 'eval' or None, got {split!r}")
         longest = int(self._remaining.max())
         if k > longest:
             raise ValueError(f"no episode of {self.path} has k = {k} steps, the longest has {longest}; lower k")
-        starts = np.flatnonzero(self._has_steps(k, part))
+        starts = np.flatnonzero(self._has_steps(k, split))
         if not len(starts):
             raise ValueError(
-                f"no transition of {k} steps in part {part!r} of {self.path} ({len(self._last)} segments, holdout "
-                f"{self.holdout}); collect more transitions or use part=None"
+                f"no transition of {k} steps in split {split!r} of {self.path} ({len(self._last)} segments, eval_fraction "
+                f"{self.eval_fraction}); collect more transitions or use split=None"
             )
         return starts
 
-    def _has_steps(self, k: int, part: Part | None) -> NDArray[np.bool_]:
-        """Per frame, whether frame t + k belongs to the same episode, of the part."""
+    def _has_steps(self, k: int, split: Split | None) -> NDArray[np.bool_]:
+        """Per frame, whether frame t + k belongs to the same episode, of the split."""
         valid: NDArray[np.bool_] = self._remaining >= k
-        return valid if part is None else valid & (self._held_out() == (part == "test"))
+        return valid if split is None else valid & (self._in_eval() == (split == "eval"))
 
-    def pairs(self, k: Steps = 1, part: Part | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def pairs(self, k: Steps = 1, split: Split | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """All pairs of frames (t, t + steps) of the same episode.
 
         :param k: steps, at least 1, or the fewest and the most of them
-        :param part: see :meth:`valid_starts`
+        :param split: see :meth:`valid_starts`
         :return: t and steps, each int64 [m]
         :raises ValueError: if there is none
         """
         fewest, most = (k, k) if isinstance(k, int) else k
         if fewest > most:
             raise ValueError(f"k must be the fewest steps and the most, got {list(k)}")  # type: ignore[arg-type]
-        self.valid_starts(fewest, part)  # raises if there is no pair at all
+        self.valid_starts(fewest, split)  # raises if there is no pair at all
         steps = np.arange(fewest, most + 1)
-        starts = [np.flatnonzero(self._has_steps(int(n), part)) for n in steps]
+        starts = [np.flatnonzero(self._has_steps(int(n), split)) for n in steps]
         return np.concatenate(starts), np.repeat(steps, [len(found) for found in starts])
 
     def frames(self, index: Any) -> NDArray[np.uint8]:
@@ -202,15 +176,15 @@ class TransitionDataset:
         seed: int = 0,
         epoch: int = 0,
         start: int = 0,
-        part: Part | None = None,
+        split: Split | None = None,
         sequences: bool = False,
-        run_length: int = 1,
-    ) -> Iterator[TransitionBatch]:
+        chunk_length: int = 1,
+    ) -> Iterator[TransitionBatch[NDArray[Any]]]:
         """One shuffled pass over all :meth:`pairs`; the last, incomplete batch is dropped.
 
         The order is a function of (seed, epoch) alone, so that a position in training is two integers.
 
-        With ``run_length`` above 1, runs of transitions that follow each other in an episode are shuffled instead of
+        With ``chunk_length`` above 1, chunks of transitions that follow each other in an episode are shuffled instead of
         single ones. A frame then ends one transition and begins the next, so that little more than half as many have to
         be read and embedded. Where episodes are cut into runs is drawn anew for each pass.
 
@@ -219,31 +193,39 @@ class TransitionDataset:
         :param seed: of the order
         :param epoch: which pass
         :param start: batches to skip
-        :param part: see :meth:`valid_starts`
+        :param split: see :meth:`valid_starts`
         :param sequences: whether actions are all k between the two frames, instead of the first
-        :param run_length: transitions per run, at least 1; with a range of steps, frames that transitions start from
+        :param chunk_length: transitions per chunk, at least 1; with a range of steps, frames that transitions start from
         :raises ValueError: if there are fewer transitions than one batch takes
         """
         if sequences and not isinstance(k, int):
             raise ValueError(f"sequences of actions need one length, got k = {k}; give one number")
-        for name, value, least in (("batch_size", batch_size, 1), ("run_length", run_length, 1), ("start", start, 0)):
+        for name, value, least in (
+            ("batch_size", batch_size, 1),
+            ("chunk_length", chunk_length, 1),
+            ("start", start, 0),
+        ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
-        starts, steps = self.pairs(k, part)
+        starts, steps = self.pairs(k, split)
         if len(starts) < batch_size:
             raise ValueError(f"batch_size {batch_size} exceeds the {len(starts)} transitions of {k} steps; lower it")
         # Drawn now and not at the first batch, so that mistakes raise here.
         generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch])))
-        order = generator.permutation(len(starts)) if run_length == 1 else self._shuffle(starts, run_length, generator)
-        return self._iterate(starts[order], steps[order], batch_size, start, sequences, run_length > 1)
+        order = (
+            generator.permutation(len(starts)) if chunk_length == 1 else self._shuffle(starts, chunk_length, generator)
+        )
+        return self._iterate(starts[order], steps[order], batch_size, start, sequences, chunk_length > 1)
 
-    def _shuffle(self, starts: NDArray[np.int64], run_length: int, generator: np.random.Generator) -> NDArray[np.int64]:
+    def _shuffle(
+        self, starts: NDArray[np.int64], chunk_length: int, generator: np.random.Generator
+    ) -> NDArray[np.int64]:
         """An order of transitions in which those of a run stay together."""
         lengths = np.diff(self._last, prepend=-1)
         # Each segment is cut at multiples of run_length, counted from a place before its beginning.
-        before = generator.integers(run_length, size=len(lengths))
+        before = generator.integers(chunk_length, size=len(lengths))
         position = np.arange(self.n_frames) - np.repeat(self._last + 1 - lengths - before, lengths)
-        begins = (position % run_length == 0) | (np.roll(self._ends, 1) != INSIDE)
+        begins = (position % chunk_length == 0) | (np.roll(self._ends, 1) != INSIDE)
         run = np.cumsum(begins)[starts]
         return np.argsort(generator.permutation(run.max() + 1)[run], kind="stable")
 
@@ -255,19 +237,19 @@ class TransitionDataset:
         start: int,
         sequences: bool,
         shared: bool,
-    ) -> Iterator[TransitionBatch]:
+    ) -> Iterator[TransitionBatch[NDArray[Any]]]:
         for i in range(start, len(starts) // batch_size):
             here = slice(i * batch_size, (i + 1) * batch_size)
             index = starts[here]
             # Both frames of a pair lie close together on disk: one gather reads each page once.
             both = np.concatenate([index, index + steps[here]])
-            now: Any = slice(None, batch_size)
-            later: Any = slice(batch_size, None)
+            obs_index: Any = slice(None, batch_size)
+            next_obs_index: Any = slice(batch_size, None)
             if shared:
                 both, places = np.unique(both, return_inverse=True)
-                now, later = places[now], places[later]
+                obs_index, next_obs_index = places[obs_index], places[next_obs_index]
             taken = index[:, None] + np.arange(steps[0]) if sequences else index
-            yield TransitionBatch(self._frames(both), self._actions[taken], now, later)
+            yield TransitionBatch(self._frames(both), self._actions[taken], obs_index, next_obs_index)
 
     def _check_index(self, index: Any) -> NDArray[np.int64]:
         array = np.asarray(index)
@@ -334,12 +316,12 @@ class TransitionDataset:
         lengths = np.diff(self._last, prepend=-1)
         return (np.repeat(self._last, lengths) - np.arange(self.n_frames)).astype(np.int32)
 
-    def _held_out(self) -> NDArray[np.bool_]:
-        """Per frame, whether its segment belongs to the test part."""
+    def _in_eval(self) -> NDArray[np.bool_]:
+        """Per frame, whether its segment belongs to the split "eval"."""
         n_segments = len(self._last)
-        n_test = min(n_segments - 1, max(1, round(self.holdout * n_segments))) if self.holdout else 0
+        n_test = min(n_segments - 1, max(1, round(self.eval_fraction * n_segments))) if self.eval_fraction else 0
         chosen = np.zeros(n_segments, dtype=bool)
-        chosen[np.random.Generator(np.random.PCG64(_HOLDOUT_SEED)).permutation(n_segments)[:n_test]] = True
+        chosen[np.random.Generator(np.random.PCG64(_SPLIT_SEED)).permutation(n_segments)[:n_test]] = True
         return np.repeat(chosen, np.diff(self._last, prepend=-1))
 
     def _check_files(self, verify: bool | None) -> None:
@@ -358,7 +340,7 @@ class TransitionDataset:
             key = (str(path.resolve()), status.st_size, status.st_mtime_ns, entry["sha256"])
             if verify is False or (verify is None and (not small or key in _VERIFIED)):
                 continue
-            if file_digest(path) != entry["sha256"]:
+            if file_hash(path) != entry["sha256"]:
                 raise DatasetError(f"{path} is damaged (sha256 does not match); {_repair(self.path, self.meta)}")
             _VERIFIED.add(key)
 

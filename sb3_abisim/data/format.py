@@ -31,6 +31,8 @@ from sb3_abisim.common.spaces import is_channels_first
 FORMAT_VERSION = 1
 # Without frames, for environments that can draw them from the factors.
 DRAWN_FORMAT_VERSION = 2
+# Keys of meta.json, and of config.json: the dataset's hash, that of its own document, and the environment's content hash.
+HASH_KEY, CHECKSUM_KEY, CONTENT_HASH_KEY = "digest", "checksum", "fingerprint"
 CONFIG_NAME = "config.json"
 META_NAME = "meta.json"
 # Values of the ends array.
@@ -43,7 +45,7 @@ IDENTITY_KEYS = (
     "observation_space",
     "action_space",
     "factors",
-    "fingerprint",
+    CONTENT_HASH_KEY,
     "policy",
     "seed",
     "n_envs",
@@ -223,10 +225,10 @@ def make_meta(config: dict[str, Any], shards: list[dict[str, Any]]) -> dict[str,
         "n_transitions": sum(shard["n_transitions"] for shard in shards),
         "n_frames": sum(shard["n_frames"] for shard in shards),
         "shards": shards,
-        "digest": _sha256(hashed),
+        HASH_KEY: _sha256(hashed),
     }
     # The digest leaves the versions out; this sum covers every character that means something.
-    return meta | {"checksum": _sha256(meta)}
+    return meta | {CHECKSUM_KEY: _sha256(meta)}
 
 
 def check_meta(meta: dict[str, Any]) -> None:
@@ -238,7 +240,7 @@ def check_meta(meta: dict[str, Any]) -> None:
     known = FORMAT_VERSION, DRAWN_FORMAT_VERSION
     if meta.get("format_version") not in known:
         raise ValueError(f"format version {meta.get('format_version')!r}, this version reads {known}")
-    if set(meta) != {*IDENTITY_KEYS, "versions", "n_transitions", "n_frames", "shards", "digest", "checksum"}:
+    if set(meta) != {*IDENTITY_KEYS, "versions", "n_transitions", "n_frames", "shards", HASH_KEY, CHECKSUM_KEY}:
         raise ValueError("its keys are not those of a dataset")
     check_factor_layout(meta["factors"])
     config = {key: meta[key] for key in (*IDENTITY_KEYS, "versions")}

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.common.spaces import space_to_json
-from sb3_abisim.data.format import DatasetError, describe_factors
+from sb3_abisim.data.format import CONTENT_HASH_KEY, DatasetError, describe_factors
 from sb3_abisim.envs.base import BatchEnv, batch_class
 
 
@@ -47,12 +47,12 @@ def make_drawer(path: Path, meta: dict[str, Any]) -> Callable[[dict[str, NDArray
         "observation_space": space_to_json(env.single_observation_space),
         "action_space": space_to_json(env.single_action_space),
         "factors": describe_factors(env.factors()),
-        "fingerprint": getattr(env, "fingerprint", None),
+        CONTENT_HASH_KEY: getattr(env, "content_hash", None),
     }
-    if here["fingerprint"] != meta["fingerprint"]:
+    if here[CONTENT_HASH_KEY] != meta[CONTENT_HASH_KEY]:
         raise DatasetError(
             f"the scenes that {path} was collected in have changed (env_kwargs {env_kwargs}: fingerprint "
-            f"{str(meta['fingerprint'])[:16]} at collection, {str(here['fingerprint'])[:16]} now), and its frames are "
+            f"{str(meta[CONTENT_HASH_KEY])[:16]} at collection, {str(here[CONTENT_HASH_KEY])[:16]} now), and its frames are "
             "drawn from them; bring the same scan files and package version back, or collect again into a new folder"
         )
     for key in ("observation_space", "action_space", "factors"):

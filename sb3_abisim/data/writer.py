@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim._version import __version__
-from sb3_abisim.common.files import LOCK_NAME, file_digest, folder_lock, is_temporary, remove_temporaries, write_atomic
+from sb3_abisim.common.files import LOCK_NAME, file_hash, folder_lock, is_temporary, remove_temporaries, write_atomic
 from sb3_abisim.data.format import (
     CONFIG_NAME,
+    HASH_KEY,
     IDENTITY_KEYS,
     META_NAME,
     DatasetError,
@@ -139,7 +140,7 @@ class DatasetWriter:
     def _is_intact(self, manifest: dict[str, Any]) -> bool:
         for name, entry in manifest["files"].items():
             path = self.folder / name
-            if not path.is_file() or path.stat().st_size != entry["bytes"] or file_digest(path) != entry["sha256"]:
+            if not path.is_file() or path.stat().st_size != entry["bytes"] or file_hash(path) != entry["sha256"]:
                 return False
         return True
 
@@ -162,7 +163,7 @@ class DatasetWriter:
             dtype, row_shape = array_layout(self._config, name)
             path = self.folder / array_file(name, shard)
             _write_npy(path, dtype, (n_frames, *row_shape), (_rows(name, dtype, row_shape, s) for s in segments))
-            files[path.name] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+            files[path.name] = {"bytes": path.stat().st_size, "sha256": file_hash(path)}
         manifest = {"n_transitions": n_transitions, "n_frames": n_frames, "files": files}
         self._write(shard_file(shard), to_json_bytes(manifest))
 
@@ -181,7 +182,7 @@ class DatasetWriter:
         content, path = to_json_bytes(meta), self.folder / META_NAME
         if not path.exists() or path.read_bytes() != content:
             self._write(META_NAME, content)
-        return str(meta["digest"])
+        return str(meta[HASH_KEY])
 
     def _manifest(self, shard: int) -> dict[str, Any] | None:
         try:

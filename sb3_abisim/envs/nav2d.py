@@ -1,4 +1,4 @@
-"""Nav2D: a 15 x 15 grid with random obstacles and the goal in the centre (section "2D Navigation" of the paper)."""
+"""Nav2D: a 15 x 15 grid with random obstacles and the goal in the center (section "2D Navigation" of the paper)."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ LAYOUTS = {
     ),
 }
 
-_COLOURS = {"floor": (240, 240, 235), "obstacles": (60, 64, 72), "goal": (46, 160, 67), "agent": (214, 40, 40)}
+_COLORS = {"floor": (240, 240, 235), "obstacles": (60, 64, 72), "goal": (46, 160, 67), "agent": (214, 40, 40)}
 _CELL_PIXELS = 32
 
 _N_CELLS = SIZE * SIZE
@@ -74,7 +74,7 @@ def _connected(start: int, goal: int, free: int) -> bool:
     return True
 
 
-def _neighbours() -> NDArray[np.int64]:
+def _neighbors() -> NDArray[np.int64]:
     """The cell that each move leads to on an empty grid, shape (SIZE * SIZE, 4)."""
     y, x = np.divmod(np.arange(_N_CELLS)[:, None], SIZE)
     dx, dy = np.array(MOVES).T
@@ -83,7 +83,7 @@ def _neighbours() -> NDArray[np.int64]:
     return cells
 
 
-_NEIGHBOURS = _neighbours()
+_NEIGHBORS = _neighbors()
 
 
 def next_cells(obstacles: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -93,12 +93,12 @@ def next_cells(obstacles: NDArray[np.bool_]) -> NDArray[np.int64]:
     :return: (SIZE * SIZE, n_actions)
     """
     stay = np.arange(_N_CELLS)[:, None]
-    cells: NDArray[np.int64] = np.where(obstacles[_NEIGHBOURS], stay, _NEIGHBOURS)
+    cells: NDArray[np.int64] = np.where(obstacles[_NEIGHBORS], stay, _NEIGHBORS)
     return cells
 
 
 class Nav2DVectorEnv(BatchEnv):
-    """Navigate a 15 x 15 grid to its centre; ``num_envs`` copies at once. ``Nav2DEnv`` is the batch of one.
+    """Navigate a 15 x 15 grid to its center; ``num_envs`` copies at once. ``Nav2DEnv`` is the batch of one.
 
     **Observation**: ``Box(0, 255, (3, 15, 15), uint8)``; channels agent, obstacles, goal, each 255 where the thing is
     and 0 elsewhere, indexed ``[channel, y, x]``. **Action**: ``Discrete(4)``, the moves (dx, dy) = (0,-1), (0,1),
@@ -207,16 +207,16 @@ class Nav2DVectorEnv(BatchEnv):
     def _render_frame(self, index: int) -> NDArray[np.uint8]:
         agent, obstacles, goal = self._pictures[index].reshape(-1, SIZE, SIZE) > 0
         cells = np.empty((SIZE, SIZE, 3), dtype=np.uint8)
-        cells[:] = _COLOURS["floor"]
-        cells[obstacles] = _COLOURS["obstacles"]
-        cells[goal] = _COLOURS["goal"]
+        cells[:] = _COLORS["floor"]
+        cells[obstacles] = _COLORS["obstacles"]
+        cells[goal] = _COLORS["goal"]
         frame = cells.repeat(_CELL_PIXELS, axis=0).repeat(_CELL_PIXELS, axis=1)
         frame[::_CELL_PIXELS] = frame[:, ::_CELL_PIXELS] = (215, 215, 210)
         y, x = (int(k[0]) for k in np.nonzero(agent))
         rows, columns = np.ogrid[: frame.shape[0], : frame.shape[1]]
-        centre_y, centre_x = (y + 0.5) * _CELL_PIXELS, (x + 0.5) * _CELL_PIXELS
-        disc = (rows + 0.5 - centre_y) ** 2 + (columns + 0.5 - centre_x) ** 2 < (0.38 * _CELL_PIXELS) ** 2
-        frame[disc] = _COLOURS["agent"]
+        center_y, center_x = (y + 0.5) * _CELL_PIXELS, (x + 0.5) * _CELL_PIXELS
+        disc = (rows + 0.5 - center_y) ** 2 + (columns + 0.5 - center_x) ** 2 < (0.38 * _CELL_PIXELS) ** 2
+        frame[disc] = _COLORS["agent"]
         return frame
 
 

@@ -45,11 +45,11 @@ def random_crop(images: th.Tensor, strength: float) -> th.Tensor:
     :param strength: share of each side that is cut away, in 0..1
     """
     n = len(images)
-    # Centres in the coordinates of grid_sample, where the picture spans -1..1.
-    centres = strength * (2.0 * th.rand(n, 2) - 1.0)
+    # Centers in the coordinates of grid_sample, where the picture spans -1..1.
+    centers = strength * (2.0 * th.rand(n, 2) - 1.0)
     theta = th.zeros(n, 2, 3)
     theta[:, 0, 0] = theta[:, 1, 1] = 1.0 - strength
-    theta[:, :, 2] = centres
+    theta[:, :, 2] = centers
     grid = nn.functional.affine_grid(theta.to(images), list(images.shape), align_corners=False)
     return nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
 

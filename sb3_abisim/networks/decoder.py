@@ -13,7 +13,7 @@ SMALLEST = 8
 
 class Decoder(nn.Module):
     """Embeddings to pictures of any size: a linear layer to a small map, then 3x3 convolutions and
-    nearest-neighbour upsampling, doubling the side until it is that of the picture.
+    nearest-neighbor upsampling, doubling the side until it is that of the picture.
 
     The paper gives no decoder. Upsampling, unlike transposed convolutions, reaches odd sides such as 15 exactly.
 

@@ -30,18 +30,19 @@ from sb3_abisim._version import __version__
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.spaces import space_to_json
+from sb3_abisim.common.vocabulary import current_env_kwargs, current_settings
 from sb3_abisim.networks.base import Encoder, make_encoder
 
 FORMAT = 1
 # The embeddings of the golden batch may differ by this fraction of the largest one (other machine, other torch).
-GOLDEN_TOLERANCE = 1e-4
+REFERENCE_TOLERANCE = 1e-4
 MAX_FILE_BYTES = 1 << 30
 HUB_PREFIX = "hf://"
 # A zoo run on a frozen encoder keeps a copy of its file under this name, in its folder <env id> beside config.yml.
 RUN_COPY = "encoder.safetensors"
 
-_METADATA_KEY = "sb3_abisim"
-_CONTRACT_KEYS = {
+_DOCUMENT_KEY = "sb3_abisim"
+_METADATA_KEYS = {
     "observation_space",
     "action_space",
     "env_id",
@@ -51,7 +52,7 @@ _CONTRACT_KEYS = {
     "dataset_digest",
     "versions",
 }
-_DIGEST_BYTES = 32
+_HASH_BYTES = 32
 _WEIGHT_PREFIX = "encoder."
 _REMEDY = "copy it again from where it came from, or write it again with sb3-abisim pretrain"
 
@@ -75,9 +76,9 @@ class EncoderFile:
     """
 
     path: Path
-    digest: str
+    hash: str
     encoder: Encoder
-    contract: dict[str, Any]
+    metadata: dict[str, Any]
 
     def check(self, observation_space: gym.Space[Any], action_space: gym.Space[Any] | None = None) -> None:
         """Refuse spaces other than those of pretraining.
@@ -90,9 +91,9 @@ class EncoderFile:
         if action_space is not None:
             sides["action_space"] = space_to_json(action_space)
         for kind, here in sides.items():
-            if here != self.contract[kind]:
+            if here != self.metadata[kind]:
                 raise ValueError(
-                    f"{self.path} was pretrained on {self.contract['env_id']} with {kind} {self.contract[kind]}, "
+                    f"{self.path} was pretrained on {self.metadata['env_id']} with {kind} {self.metadata[kind]}, "
                     f"but is to be used with {here}; use an encoder pretrained for this environment"
                 )
 
@@ -107,8 +108,8 @@ def save_encoder(
     env_kwargs: dict[str, Any],
     objective: str,
     settings: dict[str, Any],
-    dataset_digest: str,
-    golden_observations: NDArray[np.uint8],
+    dataset_hash: str,
+    reference_observations: NDArray[np.uint8],
 ) -> str:
     """Write an encoder file; the same arguments and package versions give the same bytes.
 
@@ -128,9 +129,11 @@ def save_encoder(
     shape = observation_space.shape
     if not is_image_space(observation_space) or shape is None:
         raise ValueError(f"observation_space must be uint8 images in 0..255, channels first, got {observation_space}")
-    golden = th.from_numpy(np.array(golden_observations, order="C"))
-    if golden.dtype != th.uint8 or tuple(golden.shape[1:]) != shape or len(golden) == 0:
-        raise ValueError(f"golden_observations must be uint8 (n, *{shape}), got {golden.dtype} {tuple(golden.shape)}")
+    reference = th.from_numpy(np.array(reference_observations, order="C"))
+    if reference.dtype != th.uint8 or tuple(reference.shape[1:]) != shape or len(reference) == 0:
+        raise ValueError(
+            f"golden_observations must be uint8 (n, *{shape}), got {reference.dtype} {tuple(reference.shape)}"
+        )
     document = {
         "format": FORMAT,
         "network": encoder.spec(),
@@ -141,7 +144,7 @@ def save_encoder(
             "env_kwargs": env_kwargs,
             "objective": objective,
             "settings": settings,
-            "dataset_digest": dataset_digest,
+            "dataset_digest": dataset_hash,
             "versions": _versions(),
         },
     }
@@ -154,11 +157,11 @@ def save_encoder(
     broken = [name for name, value in tensors.items() if not bool(th.isfinite(value).all())]
     if broken:
         raise ValueError(f"weights are not finite, the encoder is not saved: {broken}")
-    tensors["golden.observations"] = golden
-    tensors["golden.embeddings"] = embed(on_cpu, observation_space, golden)
-    data, digest = _serialize(tensors, text)
+    tensors["golden.observations"] = reference
+    tensors["golden.embeddings"] = embed(on_cpu, observation_space, reference)
+    data, hash = _serialize(tensors, text)
     write_atomic(path, lambda file: file.write(data))
-    return digest
+    return hash
 
 
 def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
@@ -176,29 +179,32 @@ def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
         )
     data = path.read_bytes()
     header = _header(path, data)
-    digest = _verify_digest(path, data, header)
+    hash = _verify_hash(path, data, header)
     try:
-        document = json.loads(header["__metadata__"][_METADATA_KEY])
+        document = json.loads(header["__metadata__"][_DOCUMENT_KEY])
         found = document["format"]
         if found != FORMAT:
             raise EncoderFileError(
                 f"{path} has format {found!r}, this version reads {FORMAT}; install a newer sb3_abisim"
             )
         tensors = safetensors.torch.load(data)
-        contract = document["contract"]
-        if set(contract) != _CONTRACT_KEYS:
-            raise ValueError(f"contract has the keys {sorted(contract)}, expected {sorted(_CONTRACT_KEYS)}")
-        golden, expected = tensors.pop("golden.observations"), tensors.pop("golden.embeddings")
-        if golden.dtype != th.uint8 or list(golden.shape[1:]) != contract["observation_space"]["shape"]:
-            raise ValueError(f"golden batch {tuple(golden.shape)} is not of {contract['observation_space']}")
-        space = spaces.Box(0, 255, tuple(golden.shape[1:]), np.uint8)
+        metadata = document["contract"]
+        if set(metadata) != _METADATA_KEYS:
+            raise ValueError(f"contract has the keys {sorted(metadata)}, expected {sorted(_METADATA_KEYS)}")
+        reference, expected = tensors.pop("golden.observations"), tensors.pop("golden.embeddings")
+        if reference.dtype != th.uint8 or list(reference.shape[1:]) != metadata["observation_space"]["shape"]:
+            raise ValueError(f"golden batch {tuple(reference.shape)} is not of {metadata['observation_space']}")
+        space = spaces.Box(0, 255, tuple(reference.shape[1:]), np.uint8)
         encoder = _build(space, document["network"], tensors)
     except EncoderFileError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:
         raise EncoderFileError(f"{path} is not a valid encoder file ({error!r}); {_REMEDY}") from error
-    _check_golden(path, embed(encoder, space, golden), expected)
-    return EncoderFile(path, digest, encoder, contract)
+    _check_reference(path, embed(encoder, space, reference), expected)
+    metadata = {**metadata, "dataset_hash": metadata.pop("dataset_digest")}
+    metadata["settings"] = current_settings(metadata["settings"])
+    metadata["env_kwargs"] = current_env_kwargs(metadata["env_kwargs"])
+    return EncoderFile(path, hash, encoder, metadata)
 
 
 def embed(encoder: Encoder, space: gym.Space[Any], frames: th.Tensor) -> th.Tensor:
@@ -252,13 +258,11 @@ def _versions() -> dict[str, str]:
 
 
 def _serialize(tensors: dict[str, th.Tensor], text: str) -> tuple[bytes, str]:
-    blank = safetensors.torch.save(
-        {**tensors, "digest": th.zeros(_DIGEST_BYTES, dtype=th.uint8)}, {_METADATA_KEY: text}
-    )
+    blank = safetensors.torch.save({**tensors, "digest": th.zeros(_HASH_BYTES, dtype=th.uint8)}, {_DOCUMENT_KEY: text})
     header_size = int.from_bytes(blank[:8], "little")
     start = 8 + header_size + json.loads(blank[8 : 8 + header_size])["digest"]["data_offsets"][0]
-    digest = hashlib.sha256(blank)
-    return blank[:start] + digest.digest() + blank[start + _DIGEST_BYTES :], digest.hexdigest()
+    sha256 = hashlib.sha256(blank)
+    return blank[:start] + sha256.digest() + blank[start + _HASH_BYTES :], sha256.hexdigest()
 
 
 def _header(path: Path, data: bytes) -> dict[str, Any]:
@@ -280,17 +284,17 @@ def _header(path: Path, data: bytes) -> dict[str, Any]:
     return header
 
 
-def _verify_digest(path: Path, data: bytes, header: dict[str, Any]) -> str:
+def _verify_hash(path: Path, data: bytes, header: dict[str, Any]) -> str:
     try:
         entry = header["digest"]
         start, stop = entry["data_offsets"]
         start, stop = (8 + int.from_bytes(data[:8], "little") + int(offset) for offset in (start, stop))
         stored = data[start:stop]
-        if entry["dtype"] != "U8" or len(stored) != _DIGEST_BYTES:
+        if entry["dtype"] != "U8" or len(stored) != _HASH_BYTES:
             raise ValueError("digest field has another size")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise EncoderFileError(f"{path} has no valid digest: not an encoder file, or damaged; {_REMEDY}") from error
-    actual = hashlib.sha256(data[:start] + bytes(_DIGEST_BYTES) + data[stop:])
+    actual = hashlib.sha256(data[:start] + bytes(_HASH_BYTES) + data[stop:])
     if actual.digest() != stored:
         raise EncoderFileError(
             f"{path} is damaged: its content has sha256 {actual.hexdigest()}, not {stored.hex()} as it was written; "
@@ -318,12 +322,12 @@ def _build(space: spaces.Box, network: dict[str, Any], tensors: dict[str, th.Ten
     return encoder.eval()
 
 
-def _check_golden(path: Path, actual: th.Tensor, expected: th.Tensor) -> None:
+def _check_reference(path: Path, actual: th.Tensor, expected: th.Tensor) -> None:
     if actual.shape != expected.shape or expected.dtype != th.float32:
         raise EncoderFileError(f"{path}: golden embeddings have shape {tuple(expected.shape)}; {_REMEDY}")
     error, scale = float((actual - expected).abs().max()), float(expected.abs().max())
     # Written so that NaN fails as well.
-    if not error <= GOLDEN_TOLERANCE * scale + 1e-6:
+    if not error <= REFERENCE_TOLERANCE * scale + 1e-6:
         raise EncoderFileError(
             f"{path}: the network embeds the golden batch differently than when it was saved (largest difference "
             f"{error:.3g}, embeddings up to {scale:.3g}); install the versions named in its contract, or pretrain again"

@@ -16,16 +16,16 @@ little beside the n embeddings. Two expectations over actions are offered:
 
 * ``expectation="uniform"``: the forward model predicts the next embedding for all discrete actions, or for
   ``n_action_samples`` uniform continuous ones, the same for both states (Eq. 7).
-* ``expectation="behaviour"``: pairs are transitions that took the same action, and the target uses the next states
+* ``expectation="behavior"``: pairs are transitions that took the same action, and the target uses the next states
   that were seen; no forward model stands in the target. For continuous actions a pair's actions differ by at most
   ``action_radius`` in the L2 norm. The target is then one sample of the expectation, so its loss must be the squared
-  one: the minimiser of the paper's absolute difference would be the median over actions, and an obstacle that
+  one: the minimizer of the paper's absolute difference would be the median over actions, and an obstacle that
   blocks one of four moves would not count.
 
 Two ways to choose the pairs:
 
 * ``pairs="random"``: uniformly (the paper).
-* ``pairs="near"``: half of them are the batch's nearest by base distance, and every error counts relative to its base
+* ``pairs="nearest"``: half of them are the batch's nearest by base distance, and every error counts relative to its base
   distance. Random pairs differ in where the agent is, so their distances are nearly sums of two norms, which say little
   about what else an embedding depends on; pairs with the agent in like places tell the influence of each obstacle. The
   choice looks at the states alone, so the expectation over actions stays what it is.
@@ -40,6 +40,7 @@ from typing import Any
 
 import gymnasium as gym
 import torch as th
+from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
 from sb3_abisim.networks.base import Encoder
@@ -48,13 +49,13 @@ from sb3_abisim.objectives.base import Objective, TensorBatch
 from sb3_abisim.registry import register_method
 
 LOSSES = {"l1": nn.functional.l1_loss, "smooth_l1": nn.functional.smooth_l1_loss, "mse": nn.functional.mse_loss}
-EXPECTATIONS = ("uniform", "behaviour")
+EXPECTATIONS = ("uniform", "behavior")
 WASSERSTEIN = ("means", "gaussian")
-PAIRS = ("random", "near")
-# Share of near pairs for pairs="near", and what is added to base distances, in units of their mean, so that an error
+PAIRS = ("random", "nearest")
+# Share of nearest pairs for pairs="nearest", and what is added to base distances, in units of their mean, so that an error
 # counts at most 20 times as much as that of a pair at the mean.
-NEAR_SHARE = 0.5
-NEAR_FLOOR = 0.05
+NEAREST_SHARE = 0.5
+NEAREST_FLOOR = 0.05
 HIDDEN_DIM = 256
 _LOG_STD_RANGE = (-5.0, 2.0)
 
@@ -87,7 +88,7 @@ def relative_scale(base_distance: th.Tensor) -> th.Tensor:
     """
     mean = base_distance.mean()
     # All zero (a base that has collapsed) would divide by zero; any factor will do then.
-    return mean / (base_distance + NEAR_FLOOR * mean).clamp_min(th.finfo(mean.dtype).tiny)
+    return mean / (base_distance + NEAREST_FLOOR * mean).clamp_min(th.finfo(mean.dtype).tiny)
 
 
 def w1_gaussian(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: th.Tensor) -> th.Tensor:
@@ -168,16 +169,16 @@ class ActionBisimulation(Objective):
     :param base_encoder: any trained encoder; frozen here
     :param c: weight of the recursive step, 0 <= c < 1
     :param tau: rate of the target encoder, per update; the smaller, the more updates it takes to look ahead
-    :param expectation: "uniform" or "behaviour" (module docstring)
+    :param expectation: "uniform" or "behavior" (module docstring)
     :param distance_loss: "l1" (the paper), "smooth_l1" (the released code) or "mse"
     :param wasserstein: "means" or "gaussian", which also counts the predicted variance (:func:`w1_gaussian`)
     :param l1_penalty: weight of the mean L1 norm of the embedding in the loss. Distances of most pairs are sums of two
         norms, and parts of an embedding that see only far obstacles may fluctuate at no cost; a small penalty
         silences them
-    :param pairs: "random" or "near" (module docstring)
+    :param pairs: "random" or "nearest" (module docstring)
     :param n_pairs: pairs of states per update
     :param n_action_samples: continuous actions per update for "uniform"
-    :param action_radius: see :func:`same_action_pairs`, for continuous "behaviour"
+    :param action_radius: see :func:`same_action_pairs`, for continuous "behavior"
     :param warm_start: begin from the base encoder's weights, if it is the same network
     :param forward_reset_interval: updates between resets of the forward model, None for never
     """
@@ -217,7 +218,7 @@ class ActionBisimulation(Objective):
         ):
             if value not in known:
                 raise ValueError(f"{value!r} is not one of {tuple(known)}")
-        if expectation == "behaviour" and wasserstein != "means":
+        if expectation == "behavior" and wasserstein != "means":
             raise ValueError("wasserstein='gaussian' needs the forward model of expectation='uniform'")
         if forward_reset_interval is not None and forward_reset_interval < 1:
             raise ValueError(f"forward_reset_interval must be at least 1 or None, got {forward_reset_interval}")
@@ -245,21 +246,21 @@ class ActionBisimulation(Objective):
         """Eq. 8 (and Eq. 6 for the forward model); gradients reach the encoder and the forward model alone.
 
         :param batch: transitions with k = 1
-        :raises ValueError: with ``expectation="behaviour"``, if no two of them took the same action
+        :raises ValueError: with ``expectation="behavior"``, if no two of them took the same action
         """
         with th.no_grad():
-            psi = self.base_encoder(batch.observations)
+            psi = self.base_encoder(batch.obs)
         i, j = self._sample_pairs(batch.actions, psi)
-        phi = self.encoder(batch.observations)
+        phi = self.encoder(batch.obs)
         with th.no_grad():
-            phi_next = self.target_encoder(batch.next_observations)
+            phi_next = self.target_encoder(batch.next_obs)
         terms: dict[str, th.Tensor] = {}
         forward_loss = th.zeros((), device=phi.device)
         if self.forward_model is None:
             next_distance = l1_distance(phi_next[i], phi_next[j])
         else:
             with th.no_grad():
-                phi_target = self.target_encoder(batch.observations)
+                phi_target = self.target_encoder(batch.obs)
                 next_distance = self._expected_w1(phi_target, i, j)
             forward_loss = self.forward_model.nll(phi_target, self.action_inputs(batch.actions), phi_next)
             terms["forward_nll"] = forward_loss
@@ -267,17 +268,17 @@ class ActionBisimulation(Objective):
         target = action_bisim_target(base_distance, next_distance, self.c)
         # Unlike phi[i], the gradient of index_select adds up in a fixed order on several threads, too.
         distance = l1_distance(phi.index_select(0, i), phi.index_select(0, j))
-        scale = relative_scale(base_distance) if self.pairs == "near" else th.ones_like(base_distance)
+        scale = relative_scale(base_distance) if self.pairs == "nearest" else th.ones_like(base_distance)
         metric_loss = LOSSES[self.distance_loss](scale * distance, scale * target)
         l1_norm = phi.abs().sum(dim=1).mean()
-        terms |= {"metric": metric_loss, "distance": distance.mean(), "target": target.mean(), "l1_norm": l1_norm}
+        terms |= {"metric_loss": metric_loss, "distance": distance.mean(), "target": target.mean(), "l1_norm": l1_norm}
         loss = metric_loss + self.l1_penalty * l1_norm + forward_loss
         return loss, {name: term.detach() for name, term in terms.items()}
 
     def _sample_pairs(self, actions: th.Tensor, psi: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Indices of ``n_pairs`` pairs of different transitions (all, if there are fewer), each (n_pairs,)."""
         n = len(actions)
-        if self.expectation == "behaviour":
+        if self.expectation == "behavior":
             allowed = same_action_pairs(actions, self.action_radius)
         else:
             allowed = th.ones(n, n, dtype=th.bool, device=actions.device)
@@ -287,13 +288,13 @@ class ActionBisimulation(Objective):
             raise ValueError(
                 f"no two of the batch's {n} transitions took the same action; set a larger batch_size or action_radius"
             )
-        n_near = int(NEAR_SHARE * self.n_pairs) if self.pairs == "near" else 0
-        chosen = th.randperm(len(pairs))[: self.n_pairs - n_near].to(actions.device)
-        if n_near:
+        n_nearest = int(NEAREST_SHARE * self.n_pairs) if self.pairs == "nearest" else 0
+        chosen = th.randperm(len(pairs))[: self.n_pairs - n_nearest].to(actions.device)
+        if n_nearest:
             # pdist goes through the pairs in the same order, in a tenth of the time of cdist on a CPU.
             above = th.triu_indices(n, n, offset=1, device=psi.device)
             base_distance = nn.functional.pdist(psi, p=1.0)[allowed[above[0], above[1]]]
-            chosen = th.cat([base_distance.topk(min(n_near, len(pairs)), largest=False).indices, chosen])
+            chosen = th.cat([base_distance.topk(min(n_nearest, len(pairs)), largest=False).indices, chosen])
         i, j = pairs[chosen].unbind(dim=1)
         return i, j
 
@@ -321,8 +322,7 @@ class ActionBisimulation(Objective):
     @th.no_grad()
     def after_step(self) -> None:
         """Move the target encoder, ``phi <- tau phi_eta + (1 - tau) phi``, and reset the forward model when due."""
-        for target, online in zip(self.target_encoder.parameters(), self.encoder.parameters(), strict=True):
-            target.lerp_(online, self.tau)
+        polyak_update(self.encoder.parameters(), self.target_encoder.parameters(), self.tau)
         self.n_updates += 1
         interval = self.forward_reset_interval
         if self.forward_model is not None and interval is not None and int(self.n_updates) % interval == 0:
@@ -336,6 +336,6 @@ register_method(
     extractor="ActionBisimExtractor",
     base="ssi",
     color="#0072B2",
-    curve="metric",
-    results=("metric", "distance"),
+    curve="metric_loss",
+    results=("metric_loss", "distance"),
 )

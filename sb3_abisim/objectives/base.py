@@ -1,70 +1,22 @@
 """The contract between an objective and the training loop."""
 
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import torch as th
 from torch import nn
 
+from sb3_abisim.common.transitions import TransitionBatch
 from sb3_abisim.networks.base import Encoder
 
-
-@dataclass(frozen=True)
-class TensorBatch:
-    """Transitions (s_t, a_t, s_{t+k}) on a device, observations already through SB3's ``preprocess_obs``.
-
-    :param frames: float (m, channels, height, width) in 0..1; those that several transitions share stand once
-    :param actions: a_t, int64 (batch,) for ``Discrete``, float32 (batch, action_dim) for ``Box``; with a second
-        dimension k where an objective reads a_t to a_{t+k-1}
-    :param now: where s_t stands among the frames, int64 (batch,) or a slice
-    :param later: where s_{t+k} stands among them
-    """
-
-    frames: th.Tensor
-    actions: th.Tensor
-    now: th.Tensor | slice
-    later: th.Tensor | slice
-
-    @classmethod
-    def of(cls, observations: th.Tensor, actions: th.Tensor, next_observations: th.Tensor) -> "TensorBatch":
-        """A batch of transitions that share no frame.
-
-        :param observations: s_t, float (batch, channels, height, width) in 0..1
-        :param actions: see the class
-        :param next_observations: s_{t+k}, as ``observations``
-        """
-        n = len(observations)
-        return cls(th.cat([observations, next_observations]), actions, slice(None, n), slice(n, None))
-
-    @property
-    def observations(self) -> th.Tensor:
-        """s_t, float (batch, channels, height, width) in 0..1."""
-        return _rows(self.frames, self.now)
-
-    @property
-    def next_observations(self) -> th.Tensor:
-        """s_{t+k}, as ``observations``."""
-        return _rows(self.frames, self.later)
-
-    def at_both_ends(self, embeddings: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Embeddings of s_t and of s_{t+k}.
-
-        :param embeddings: of the frames, (m, features_dim)
-        :return: two tensors (batch, features_dim)
-        """
-        return _rows(embeddings, self.now), _rows(embeddings, self.later)
-
-
-def _rows(tensor: th.Tensor, where: th.Tensor | slice) -> th.Tensor:
-    # Unlike tensor[where], the gradient of index_select adds up in a fixed order on several threads, too.
-    return tensor[where] if isinstance(where, slice) else tensor.index_select(0, where)
+# Observations already through SB3's ``preprocess_obs``, on the objective's device.
+TensorBatch = TransitionBatch[th.Tensor]
 
 
 class Objective(nn.Module):
     """A loss and everything it trains: the encoder and its heads.
 
-    No optimiser, logging or file is known here. Whatever must survive an interruption is a parameter or a buffer.
+    No optimizer, logging or file is known here. Whatever must survive an interruption is a parameter or a buffer.
 
     :param encoder: the network to pretrain
     :param action_space: ``Discrete`` (starting at 0) or one-dimensional ``Box``
@@ -107,7 +59,7 @@ class Objective(nn.Module):
     def action_inputs(self, actions: th.Tensor) -> th.Tensor:
         """Actions as network inputs.
 
-        :param actions: as in :class:`TensorBatch`
+        :param actions: as in :class:`~sb3_abisim.common.transitions.TransitionBatch`
         :return: float32 (batch, action_dim), or (batch, k, action_dim)
         """
         if self.n_actions is None:
@@ -115,7 +67,7 @@ class Objective(nn.Module):
         return nn.functional.one_hot(actions, self.n_actions).float()
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """The scalar to minimise, and its named terms (detached) for the log.
+        """The scalar to minimize, and its named terms (detached) for the log.
 
         :param batch: transitions
         """
@@ -129,4 +81,4 @@ class Objective(nn.Module):
         return None
 
     def after_step(self) -> None:
-        """Called after each optimiser step, for target networks and schedules."""
+        """Called after each optimizer step, for target networks and schedules."""

@@ -69,12 +69,12 @@ class BetaVAE(Objective):
 
         :param batch: transitions, of which the observations alone are read
         """
-        mean = self.encoder(batch.observations)
+        mean = self.encoder(batch.obs)
         log_std = self.log_std(mean).clamp(*_LOG_STD_RANGE)
         z = mean + log_std.exp() * th.randn(mean.shape).to(mean.device)
         logits = self.decoder(z)
-        loss, terms = beta_vae_loss(logits, batch.observations, mean, log_std, self.kl_weight)
-        terms["squared_error"] = (logits.sigmoid() - batch.observations).pow(2).mean()
+        loss, terms = beta_vae_loss(logits, batch.obs, mean, log_std, self.kl_weight)
+        terms["squared_error"] = (logits.sigmoid() - batch.obs).pow(2).mean()
         return loss, {name: term.detach() for name, term in terms.items()}
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import gymnasium as gym
 import torch as th
+from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
 from sb3_abisim.networks.augmentations import AUGMENTATIONS
@@ -35,8 +36,8 @@ def curl_loss(query: th.Tensor, key: th.Tensor, weight: th.Tensor) -> tuple[th.T
     """
     logits = query @ weight @ key.T
     labels = th.arange(len(query), device=query.device)
-    contrast = nn.functional.cross_entropy(logits, labels)
-    return contrast, {"contrast": contrast, "accuracy": (logits.argmax(dim=1) == labels).float().mean()}
+    info_nce = nn.functional.cross_entropy(logits, labels)
+    return info_nce, {"info_nce": info_nce, "accuracy": (logits.argmax(dim=1) == labels).float().mean()}
 
 
 class CURL(Objective):
@@ -80,22 +81,21 @@ class CURL(Objective):
         return 1.0 / batch_size
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """InfoNCE between two changed copies; terms ``contrast`` and ``accuracy`` (share of keys found).
+        """InfoNCE between two changed copies; terms ``info_nce`` and ``accuracy`` (share of keys found).
 
         :param batch: transitions, of which the observations alone are read
         """
         augment = AUGMENTATIONS[self.augmentation]
-        query = self.encoder(augment(batch.observations, self.strength))
+        query = self.encoder(augment(batch.obs, self.strength))
         with th.no_grad():
-            key = self.key_encoder(augment(batch.observations, self.strength))
+            key = self.key_encoder(augment(batch.obs, self.strength))
         loss, terms = curl_loss(query, key, self.weight)
         return loss, {name: term.detach() for name, term in terms.items()}
 
     @th.no_grad()
     def after_step(self) -> None:
         """Move the key encoder, ``k <- tau q + (1 - tau) k``."""
-        for key, query in zip(self.key_encoder.parameters(), self.encoder.parameters(), strict=True):
-            key.lerp_(query, self.tau)
+        polyak_update(self.encoder.parameters(), self.key_encoder.parameters(), self.tau)
 
 
 register_method("curl", CURL, label="CURL", extractor="CURLExtractor", color="#E69F00")

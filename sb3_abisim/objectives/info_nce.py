@@ -9,7 +9,7 @@ d                     minus the L2 distance                    similarity
 a+, a-                ``actions``, all other ``candidates``    action taken, actions not taken
 ====================  =======================================  ==========================================
 
-Choices: the paper's equation is the likelihood itself and says "d is the l2 distance"; minimised as written it would
+Choices: the paper's equation is the likelihood itself and says "d is the l2 distance"; minimized as written it would
 push each transition away from its action, so the loss here is the negative logarithm, and d minus the distance.
 
 The pair is written [psi(s), psi(s') - psi(s)], not [psi(s), psi(s')]: an embedded action can be near to the change
@@ -48,8 +48,8 @@ def info_nce_loss(
     if excluded is not None:
         own = nn.functional.one_hot(positives, len(candidates)).bool()
         logits = logits.masked_fill(excluded & ~own, -math.inf)
-    contrast = nn.functional.cross_entropy(logits, positives)
-    return contrast, {"contrast": contrast, "accuracy": (logits.argmax(dim=1) == positives).float().mean()}
+    info_nce = nn.functional.cross_entropy(logits, positives)
+    return info_nce, {"info_nce": info_nce, "accuracy": (logits.argmax(dim=1) == positives).float().mean()}
 
 
 class InfoNCE(Objective):
@@ -89,11 +89,11 @@ class InfoNCE(Objective):
         return 1.0 / (batch_size if self.n_actions is None else min(batch_size, self.n_actions**self.k))
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """InfoNCE; terms ``contrast``, ``l1_norm`` and ``accuracy`` (share of actions found among the candidates).
+        """InfoNCE; terms ``info_nce``, ``l1_norm`` and ``accuracy`` (share of actions found among the candidates).
 
         :param batch: transitions with ``actions`` of shape (batch, k) or (batch, k, action_dim)
         """
-        psi, psi_next = batch.at_both_ends(self.encoder(batch.frames))
+        psi, psi_next = batch.split_pair(self.encoder(batch.frames))
         pairs = th.cat([psi, psi_next - psi], dim=1)
         if self.n_actions is not None and self.k == 1:
             candidates = self.action_encoder(th.eye(self.n_actions, device=pairs.device))

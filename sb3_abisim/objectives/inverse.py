@@ -1,4 +1,4 @@
-"""Regularised inverse dynamics (the paper's Eq. 5, L_ss): SSI for k = 1, ACRO for k > 1.
+"""Regularized inverse dynamics (the paper's Eq. 5, L_ss): SSI for k = 1, ACRO for k > 1.
 
 ====================  =======================================  ==========================================
 paper                 here                                     meaning
@@ -6,7 +6,7 @@ paper                 here                                     meaning
 psi_theta             ``encoder``                              single-step encoder
 f_nu,inverse          ``inverse_model``                        weak model of p(a | psi(s), psi(s'))
 beta                  ``l1_penalty``                           weight of the L1 norm of both embeddings
-beta_max, alpha       ``l1_penalty``, ``accuracy``             adaptive regularisation (appendix)
+beta_max, alpha       ``l1_penalty``, ``accuracy``             adaptive regularization (appendix)
 ====================  =======================================  ==========================================
 
 Choices: losses are means over the batch where the paper writes sums over the data set. The paper's table ends the
@@ -27,7 +27,7 @@ from sb3_abisim.networks.heads import MLP
 from sb3_abisim.objectives.base import Objective, TensorBatch
 from sb3_abisim.registry import register_method
 
-ADAPTIVE_FORMS = ("paper", "released", "above_chance")
+ADAPTIVE_FORMS = ("paper", "released", "chance_corrected")
 HIDDEN_DIM = 256
 _LOG_STD_RANGE = (-5.0, 2.0)
 
@@ -42,24 +42,24 @@ def inverse_dynamics_loss(
     :param psi_next: embedding of s', (batch, features_dim)
     :param beta: weight of the penalty, at least 0
     """
-    prediction = -log_prob.mean()
+    inverse_nll = -log_prob.mean()
     l1_norm = (psi.abs().sum(dim=1) + psi_next.abs().sum(dim=1)).mean()
-    return prediction + beta * l1_norm, {"prediction": prediction, "l1_norm": l1_norm}
+    return inverse_nll + beta * l1_norm, {"inverse_nll": inverse_nll, "l1_norm": l1_norm}
 
 
 def adaptive_beta(beta_max: float, accuracy: th.Tensor, form: str, chance: float = 0.0) -> th.Tensor:
-    """The regularisation for the present accuracy: more of it once actions are predicted well.
+    """The regularization for the present accuracy: more of it once actions are predicted well.
 
     Guessing one of n actions is right in 1 of n cases, for which both other forms already ask for some penalty: an
-    embedding that has found nothing yet can be held at zero by it for good. "above_chance" asks for none then.
+    embedding that has found nothing yet can be held at zero by it for good. "chance_corrected" asks for none then.
 
     :param beta_max: largest weight
     :param accuracy: of the previous iteration, 0..1
     :param form: "paper", ``beta_max (1 - exp(-4 alpha^2))``, "released", ``beta_max exp(-5 (alpha - 1)^2)``, or
-        "above_chance" (ours), the paper's with alpha the share of the way from chance to certainty
+        "chance_corrected" (ours), the paper's with alpha the share of the way from chance to certainty
     :param chance: accuracy of guessing, below 1
     """
-    if form == "above_chance":
+    if form == "chance_corrected":
         accuracy = ((accuracy - chance) / (1.0 - chance)).clamp_min(0.0)
         form = "paper"
     if form == "paper":
@@ -73,8 +73,8 @@ class InverseDynamics(Objective):
     :param encoder: the network to pretrain
     :param action_space: ``Discrete`` or one-dimensional ``Box``
     :param l1_penalty: beta, or beta_max with ``adaptive``
-    :param adaptive: None for a fixed beta, else "paper", "released" or "above_chance" (see :func:`adaptive_beta`)
-    :param change_weight: how much more the inverse model's input shows of the change than of the state:
+    :param adaptive: None for a fixed beta, else "paper", "released" or "chance_corrected" (see :func:`adaptive_beta`)
+    :param delta_scale: how much more the inverse model's input shows of the change than of the state:
         (psi(s) / w, w (psi(s') - psi(s))). Where the agent is a small part of a varied picture, a large weight lets the
         change stand out from the start; 1 is the plain input
     """
@@ -87,18 +87,18 @@ class InverseDynamics(Objective):
         action_space: gym.Space[Any],
         l1_penalty: float = 1e-4,
         adaptive: str | None = None,
-        change_weight: float = 1.0,
+        delta_scale: float = 1.0,
     ) -> None:
         super().__init__(encoder, action_space)
         if not 0 <= l1_penalty < math.inf:
             raise ValueError(f"l1_penalty must be a number of at least 0, got {l1_penalty}")
         if adaptive is not None and adaptive not in ADAPTIVE_FORMS:
             raise ValueError(f"adaptive must be None or one of {ADAPTIVE_FORMS}, got {adaptive!r}")
-        if not 0 < change_weight < math.inf:
-            raise ValueError(f"change_weight must be a number above 0, got {change_weight}")
+        if not 0 < delta_scale < math.inf:
+            raise ValueError(f"change_weight must be a number above 0, got {delta_scale}")
         self.l1_penalty = l1_penalty
         self.adaptive = adaptive
-        self.change_weight = change_weight
+        self.delta_scale = delta_scale
         n_outputs = self.n_actions or 2 * self.action_dim
         self.inverse_model = MLP(2 * encoder.features_dim, HIDDEN_DIM, n_outputs)
         # Accuracy of the previous iteration; a buffer, so that an interrupted run goes on with the same beta.
@@ -106,12 +106,12 @@ class InverseDynamics(Objective):
         self.register_buffer("accuracy", th.zeros(()))
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """Eq. 5 on a batch; terms ``prediction``, ``l1_norm``, ``beta`` and ``accuracy``.
+        """Eq. 5 on a batch; terms ``inverse_nll``, ``l1_norm``, ``beta`` and ``accuracy``.
 
         :param batch: transitions (s_t, a_t, s_{t+k})
         """
-        psi, psi_next = batch.at_both_ends(self.encoder(batch.frames))
-        inputs = th.cat([psi / self.change_weight, self.change_weight * (psi_next - psi)], dim=1)
+        psi, psi_next = batch.split_pair(self.encoder(batch.frames))
+        inputs = th.cat([psi / self.delta_scale, self.delta_scale * (psi_next - psi)], dim=1)
         log_prob, accuracy = self._score(self.inverse_model(inputs), batch.actions)
         beta = th.as_tensor(self.l1_penalty)
         if self.adaptive is not None:

@@ -23,7 +23,7 @@ def reproducing_commands(settings: dict[str, Any], config: PretrainConfig, meta:
             collect += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in meta["env_kwargs"].items())]
         commands.append(f"sb3-abisim collect {shlex.join(collect)}")
     words = ["--objective", settings["objective"], "--env", meta["env_id"], "--seed", str(settings["seed"])]
-    words += ["--data", "DATA", "-o", "FILE"] + (["--base", "BASE"] if "base_digest" in settings else [])
+    words += ["--data", "DATA", "-o", "FILE"] + (["--base", "BASE"] if "base_hash" in settings else [])
     words += ["-params", *(f"{name}:{json.dumps(value)}" for name, value in config.as_settings().items())]
     commands.append(f"sb3-abisim pretrain {shlex.join(words)}")
     return commands

@@ -1,4 +1,4 @@
-"""Checkpoints of a pretraining run: weights, optimiser, random state and position in one safetensors file."""
+"""Checkpoints of a pretraining run: weights, optimizer, random state and position in one safetensors file."""
 
 import hashlib
 import json
@@ -12,7 +12,7 @@ from torch import nn
 
 from sb3_abisim.common.files import write_atomic
 
-_DIGEST_BYTES = 32
+_HASH_BYTES = 32
 
 
 def save_training_state(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, metadata: dict[str, Any]) -> None:
@@ -36,7 +36,7 @@ def save_training_state(path: Path, module: nn.Module, optimizer: th.optim.Optim
 def load_training_state(
     path: Path, module: nn.Module, optimizer: th.optim.Optimizer, settings: dict[str, Any]
 ) -> dict[str, Any]:
-    """Put a checkpoint back into a module, its optimiser and the random state.
+    """Put a checkpoint back into a module, its optimizer and the random state.
 
     :param path: the file
     :param module: gets parameters and buffers
@@ -46,8 +46,8 @@ def load_training_state(
     :raises ValueError: for a damaged file or another run's checkpoint
     """
     whole = path.read_bytes()
-    content, digest = whole[:-_DIGEST_BYTES], whole[-_DIGEST_BYTES:]
-    if hashlib.sha256(content).digest() != digest:
+    content, hash = whole[:-_HASH_BYTES], whole[-_HASH_BYTES:]
+    if hashlib.sha256(content).digest() != hash:
         raise ValueError(f"{path} is damaged; remove it to go on from the checkpoint before it")
     tensors = load_tensors(content)
     header_size = int.from_bytes(content[:8], "little")

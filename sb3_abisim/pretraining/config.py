@@ -14,15 +14,15 @@ from sb3_abisim.common.paths import resource_path
 class PretrainConfig:
     """The settings of one pretraining run; the keys of the YAML files are these names.
 
-    :param n_updates: optimiser steps
+    :param n_updates: optimizer steps
     :param batch_size: transitions per update
     :param learning_rate: of Adam; a number keeps it constant, ``lin_NUMBER`` lowers it in a straight line to 0, as in
         the zoo's files
     :param k: steps between the two observations of a transition; ``[fewest, most]`` takes all pairs of observations
         with a number of steps in this range
-    :param run_length: batches are made of runs of so many transitions that follow each other in an episode; above 1,
+    :param chunk_length: batches are made of chunks of so many transitions that follow each other in an episode; above 1,
         objectives that embed both observations have fewer to embed (docs/pretraining.md)
-    :param holdout: share of the episodes that is only evaluated on, 0 <= holdout < 1
+    :param eval_fraction: share of the episodes that is only evaluated on, 0 <= eval_fraction < 1
     :param log_interval: updates between two rows of the log
     :param checkpoint_interval: least updates between two checkpoints, each written at a row of the log
     :param network: name of the encoder network, None for the default of the observation's shape
@@ -34,8 +34,8 @@ class PretrainConfig:
     batch_size: int = 256
     learning_rate: float | str = 1e-4
     k: int | list[int] = 1
-    run_length: int = 1
-    holdout: float = 0.05
+    chunk_length: int = 1
+    eval_fraction: float = 0.05
     log_interval: int = 500
     checkpoint_interval: int = 1_000
     network: str | None = None
@@ -43,7 +43,7 @@ class PretrainConfig:
     objective_kwargs: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("n_updates", "batch_size", "run_length", "log_interval", "checkpoint_interval"):
+        for name in ("n_updates", "batch_size", "chunk_length", "log_interval", "checkpoint_interval"):
             value = getattr(self, name)
             if not _is_count(value):
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
@@ -52,8 +52,8 @@ class PretrainConfig:
             raise ValueError(f"k must be a whole number of at least 1, or [fewest, most], got {self.k!r}")
         if not 0 < self.learning_rate_at(0) < math.inf:
             raise ValueError(f"learning_rate must be a number above 0, got {self.learning_rate!r}")
-        if not isinstance(self.holdout, int | float) or not 0 <= self.holdout < 1:
-            raise ValueError(f"holdout must lie in [0, 1), got {self.holdout!r}")
+        if not isinstance(self.eval_fraction, int | float) or not 0 <= self.eval_fraction < 1:
+            raise ValueError(f"eval_fraction must lie in [0, 1), got {self.eval_fraction!r}")
         for name in ("network_kwargs", "objective_kwargs"):
             if not isinstance(getattr(self, name), dict):
                 raise ValueError(f"{name} must be a mapping, got {getattr(self, name)!r}")
@@ -78,11 +78,11 @@ class PretrainConfig:
     def as_settings(self) -> dict[str, Any]:
         """The settings by name, as encoder files hold them.
 
-        Those of files from before ``run_length`` existed stay equal to those of the same run now.
+        Those of files from before ``chunk_length`` existed stay equal to those of the same run now.
         """
         settings = dataclasses.asdict(self)
-        if self.run_length == 1:
-            del settings["run_length"]
+        if self.chunk_length == 1:
+            del settings["chunk_length"]
         return settings
 
     @classmethod

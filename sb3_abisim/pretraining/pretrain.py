@@ -70,7 +70,7 @@ def pretrain(
     _check_place_of_card(output.with_suffix(".json"))
     env_id = read_env_id(Path(data))
     config = config or load_config(objective, env_id)
-    dataset = TransitionDataset(data, holdout=config.holdout)
+    dataset = TransitionDataset(data, eval_fraction=config.eval_fraction)
     _check_parts(dataset, config)
     if base_method is not None and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
@@ -80,7 +80,7 @@ def pretrain(
         # Of the same network and data, whatever this one is asked to have.
         base_config = load_config(base_method, env_id)
         base_config = dataclasses.replace(
-            base_config, network=config.network, network_kwargs=config.network_kwargs, holdout=config.holdout,
+            base_config, network=config.network, network_kwargs=config.network_kwargs, eval_fraction=config.eval_fraction,
             batch_size=min(base_config.batch_size, config.batch_size),
         )  # fmt: skip
         pretrain(base_method, data, base, base_config, None, seed, device, progress_bar, verbose)
@@ -112,12 +112,12 @@ def _check_parts(dataset: "TransitionDataset", config: PretrainConfig) -> None:
             f"{dataset.path} has {n} transitions to train on, too few for a batch of {config.batch_size}; collect more "
             "or set a smaller batch_size"
         )
-    if config.holdout:
+    if config.eval_fraction:
         try:
-            dataset.pairs(config.k, "test")
+            dataset.pairs(config.k, "eval")
         except ValueError as error:
-            what = f"no segment held out of {dataset.path} (holdout {config.holdout}) has a transition of k steps"
-            raise ValueError(f"{what}; collect more transitions, or set holdout:0") from error
+            what = f"no segment of the eval split of {dataset.path} (eval_fraction {config.eval_fraction}) has a transition of k steps"
+            raise ValueError(f"{what}; collect more transitions, or set eval_fraction:0") from error
 
 
 def _check_place_of_card(path: Path) -> None:

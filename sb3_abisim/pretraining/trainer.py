@@ -16,7 +16,9 @@ from stable_baselines3.common.utils import get_device
 from tqdm import tqdm
 
 from sb3_abisim.common.files import write_atomic
-from sb3_abisim.data.dataset import Part, TransitionBatch, TransitionDataset
+from sb3_abisim.common.transitions import TransitionBatch
+from sb3_abisim.data.dataset import Split, TransitionDataset
+from sb3_abisim.data.format import CONTENT_HASH_KEY, HASH_KEY
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
@@ -30,9 +32,9 @@ Callback = Callable[[Encoder], Mapping[str, float]]
 
 # Arguments of an objective that follow from other settings.
 FOLLOWING = {"k", "encoder", "action_space", "base_encoder"}
-N_GOLDEN = 8
+N_REFERENCE = 8
 N_STANDARDIZE = 4096
-N_HOLDOUT_BATCHES = 8
+N_EVAL_BATCHES = 8
 
 
 def make_objective(
@@ -84,7 +86,7 @@ class PretrainRun:
         self.settings: dict[str, Any] = {
             "objective": objective,
             "seed": seed,
-            "dataset_digest": dataset.digest,
+            "dataset_hash": dataset.hash,
             **config.as_settings(),
         }
         base_encoder = None
@@ -92,8 +94,8 @@ class PretrainRun:
             base_file = load_encoder(base)
             base_file.check(dataset.observation_space, dataset.action_space)
             base_encoder = base_file.encoder
-            self.settings["base_digest"] = base_file.digest
-            self.settings["base_objective"] = base_file.contract["objective"]
+            self.settings["base_hash"] = base_file.hash
+            self.settings["base_objective"] = base_file.metadata["objective"]
         # Weights are drawn on the CPU, so that they do not depend on the device.
         th.manual_seed(seed)
         module = make_objective(objective, dataset, config, base_encoder)
@@ -114,7 +116,7 @@ class PretrainRun:
         if not self.output.exists():
             return False
         try:
-            settings = load_encoder(self.output).contract["settings"]
+            settings = load_encoder(self.output).metadata["settings"]
         except EncoderFileError as error:
             raise ValueError(f"{error}. To have it written again, remove it first") from error
         _refuse_other_settings(self.output, settings, self.settings)
@@ -150,7 +152,7 @@ class PretrainRun:
         """Write the card and, last, the encoder file; its presence says that the run is over."""
         dataset = self.dataset
         starts = dataset.valid_starts()
-        golden = dataset.frames(starts[:: max(1, len(starts) // N_GOLDEN)][:N_GOLDEN])
+        reference = dataset.frames(starts[:: max(1, len(starts) // N_REFERENCE)][:N_REFERENCE])
         encoder = self.module.encoder.cpu()
         encoder.standardize(self._sample_observations())
         card = self._card(n_parameters=sum(p.numel() for p in encoder.parameters()))
@@ -165,20 +167,20 @@ class PretrainRun:
             env_kwargs=dataset.env_kwargs,
             objective=self.settings["objective"],
             settings=self.settings,
-            dataset_digest=dataset.digest,
-            golden_observations=golden,
+            dataset_hash=dataset.hash,
+            reference_observations=reference,
         )
         self.drop_checkpoints()
         self._warn_at_chance()
 
     def _warn_at_chance(self) -> None:
         """An encoder that has learned nothing looks like any other file."""
-        name = "test/accuracy" if self.config.holdout else "train/accuracy"
+        name = "eval/accuracy" if self.config.eval_fraction else "train/accuracy"
         accuracy = self.rows[-1].get(name) if self.rows else None
-        batch_size, n = self.config.batch_size, self.config.batch_size * N_HOLDOUT_BATCHES
-        if self.config.holdout:
-            n_test = len(self.dataset.pairs(self.config.k, "test")[0])
-            batch_size, n = min(batch_size, n_test), min(n, n_test)
+        batch_size, n = self.config.batch_size, self.config.batch_size * N_EVAL_BATCHES
+        if self.config.eval_fraction:
+            n_eval = len(self.dataset.pairs(self.config.k, "eval")[0])
+            batch_size, n = min(batch_size, n_eval), min(n, n_eval)
         chance = self.module.chance_accuracy(batch_size)
         if accuracy is None or chance is None:
             return
@@ -186,13 +188,13 @@ class PretrainRun:
             warnings.warn(
                 f"{self.output}: {name} ended at {accuracy:.3g}, no better than guessing ({chance:.3g}), so the "
                 "encoder has learned nothing of its objective; try more updates, another seed, a smaller l1_penalty "
-                "or, for ssi and acro, a change_weight above 1",
+                "or, for ssi and acro, a delta_scale above 1",
                 stacklevel=2,
             )
 
     def _sample_observations(self) -> th.Tensor:
         """Observations from all over the dataset, as floats on the CPU."""
-        starts = self.dataset.valid_starts(part="train")
+        starts = self.dataset.valid_starts(split="train")
         frames = self.dataset.frames(starts[:: max(1, len(starts) // N_STANDARDIZE)][:N_STANDARDIZE])
         observations = preprocess_obs(th.as_tensor(frames), self.dataset.observation_space)
         assert isinstance(observations, th.Tensor)
@@ -205,7 +207,7 @@ class PretrainRun:
             "settings": self.settings,
             "commands": reproducing_commands(self.settings, self.config, dataset.meta),
             "dataset": {
-                key: dataset.meta[key] for key in ("digest", "env_id", "env_kwargs", "fingerprint", "n_transitions")
+                key: dataset.meta[key] for key in (HASH_KEY, "env_id", "env_kwargs", CONTENT_HASH_KEY, "n_transitions")
             },
             "features_dim": self.module.encoder.features_dim,
             "n_parameters": n_parameters,
@@ -257,7 +259,7 @@ class PretrainRun:
         self.finish()
 
     def _update(self, batch: TensorBatch) -> dict[str, th.Tensor]:
-        """One optimiser step; refuses to go on with numbers that are not finite."""
+        """One optimizer step; refuses to go on with numbers that are not finite."""
         self.module.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate_at(self.n_updates)
@@ -291,48 +293,48 @@ class PretrainRun:
                 if self.n_updates >= config.n_updates:
                     return
 
-    def _pass(self, batch_size: int, part: Part, epoch: int = 0, start: int = 0) -> Iterator[TransitionBatch]:
+    def _pass(self, batch_size: int, split: Split, epoch: int = 0, start: int = 0) -> Iterator[TransitionBatch[Any]]:
         sequences = self.module.reads_action_sequences
         # What is evaluated on is the same for all lengths of runs.
-        k, run_length = self.config.k, self.config.run_length if part == "train" else 1
+        k, chunk_length = self.config.k, self.config.chunk_length if split == "train" else 1
         return self.dataset.batches(
-            batch_size, k, self.seed, epoch, start, part=part, sequences=sequences, run_length=run_length
+            batch_size, k, self.seed, epoch, start, split=split, sequences=sequences, chunk_length=chunk_length
         )
 
-    def _to_tensors(self, batch: TransitionBatch) -> TensorBatch:
+    def _to_tensors(self, batch: TransitionBatch[Any]) -> TensorBatch:
         """Through SB3's own preprocessing, so that pretraining sees the numbers that RL will see."""
         space = self.dataset.observation_space
         # Bytes are put in channels-last order before they become floats, four times as large.
         frames = th.as_tensor(batch.frames).contiguous(memory_format=th.channels_last).to(self.device)
         observations = preprocess_obs(frames, space)
         assert isinstance(observations, th.Tensor)
-        now, later = (
-            where if isinstance(where, slice) else th.as_tensor(where).to(self.device)
-            for where in (batch.now, batch.later)
+        obs_index, next_obs_index = (
+            index if isinstance(index, slice) else th.as_tensor(index).to(self.device)
+            for index in (batch.obs_index, batch.next_obs_index)
         )
-        return TensorBatch(observations, th.as_tensor(batch.actions).to(self.device), now, later)
+        return TensorBatch(observations, th.as_tensor(batch.actions).to(self.device), obs_index, next_obs_index)
 
     def _log(self, logger: Logger, sums: dict[str, float]) -> None:
         n = self.n_updates - (int(self.rows[-1]["n_updates"]) if self.rows else 0)
         row = {f"train/{name}": value / n for name, value in sums.items()}
-        row |= {f"test/{name}": value for name, value in self._evaluate().items()}
+        row |= {f"eval/{name}": value for name, value in self._evaluate().items()}
         row |= self._called_back()
         self.rows.append({"n_updates": self.n_updates, **row})
         for name, value in row.items():
             logger.record(name, value)
-        logger.record("time/n_updates", self.n_updates)
+        logger.record("train/n_updates", self.n_updates)
         logger.dump(self.n_updates)
 
     def _evaluate(self) -> dict[str, float]:
         """Mean terms over held-out batches; the random state is left as it was."""
-        if not self.config.holdout:
+        if not self.config.eval_fraction:
             return {}
         self.module.eval()
         means: dict[str, float] = {}
-        n_test = len(self.dataset.pairs(self.config.k, "test")[0])
-        batches = self._pass(min(self.config.batch_size, n_test), "test")
+        n_eval = len(self.dataset.pairs(self.config.k, "eval")[0])
+        batches = self._pass(min(self.config.batch_size, n_eval), "eval")
         with th.no_grad(), th.random.fork_rng(devices=[]):
-            rows = [self.module.loss(self._to_tensors(b))[1] for b in itertools.islice(batches, N_HOLDOUT_BATCHES)]
+            rows = [self.module.loss(self._to_tensors(b))[1] for b in itertools.islice(batches, N_EVAL_BATCHES)]
         for name in rows[0] if rows else ():
             means[name] = sum(float(row[name]) for row in rows) / len(rows)
         return means
@@ -352,7 +354,7 @@ class PretrainRun:
         for output in logger.output_formats:
             if isinstance(output, CSVOutputFormat):
                 for row in self.rows:
-                    values = {"time/n_updates": row["n_updates"], **row}
+                    values = {"train/n_updates": row["n_updates"], **row}
                     del values["n_updates"]
                     output.write(dict(sorted(values.items())), dict.fromkeys(values, ()))
         return logger

@@ -13,7 +13,7 @@ class EncoderCallback(BaseCallback):
 
     Also states the fingerprint of the clips or scans that the training environment shows, if it has one, and lets torch
     reuse memory (:mod:`sb3_abisim.common.malloc`). Logs
-    ``encoder/drift`` at the end of each rollout: how far the weights have moved from those that training started with,
+    ``encoder/relative_weight_change`` at the end of each rollout: how far the weights have moved from those that training started with,
     relative to the norm of the latter (the largest value, where actor and critic have encoders of their own).
 
     :param verbose: as in Stable-Baselines3
@@ -26,7 +26,7 @@ class EncoderCallback(BaseCallback):
         require_weights(self.model)
         self._extractors = [extractor for _, extractor in find_extractors(self.model.policy)]
         for name, extractor in find_extractors(self.model.policy):
-            origin = f"digest {extractor.digest}" if extractor.digest else "random weights"
+            origin = f"digest {extractor.hash}" if extractor.hash else "random weights"
             state = "frozen" if extractor.frozen else "trained along"
             print(
                 f"Encoder {name}: {type(extractor).__name__}, source {extractor.source}, {origin}, "
@@ -44,17 +44,20 @@ class EncoderCallback(BaseCallback):
                 )
             print(
                 f"Encoder of the environment: {type(encoding).__name__}, source {encoding.source}, "
-                f"digest {encoding.encoder_file.digest}, {encoding.n_parameters} parameters, frozen"
+                f"digest {encoding.encoder_file.hash}, {encoding.n_parameters} parameters, frozen"
             )
         elif not self._extractors:
             print("Encoder: none of sb3_abisim's, policy_kwargs names another features extractor")
-        if self.training_env.has_attr("fingerprint"):
-            (fingerprint,) = self.training_env.get_attr("fingerprint", indices=0)
-            print(f"Pictures of the training environment: {fingerprint}")
+        if self.training_env.has_attr("content_hash"):
+            (content_hash,) = self.training_env.get_attr("content_hash", indices=0)
+            print(f"Pictures of the training environment: {content_hash}")
 
     def _on_rollout_end(self) -> None:
         if self._extractors:
-            self.logger.record("encoder/drift", max(extractor.drift() for extractor in self._extractors))
+            self.logger.record(
+                "encoder/relative_weight_change",
+                max(extractor.relative_weight_change() for extractor in self._extractors),
+            )
 
     def _on_step(self) -> bool:
         return True

@@ -46,22 +46,22 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
     """
     asked_class = policy_kwargs.get("features_extractor_class")
     kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
-    here, digest, absent = "none of our extractors", None, False
+    here, hash, absent = "none of our extractors", None, False
     if asked_class is not None:
         if not (isinstance(asked_class, type) and issubclass(asked_class, EncoderExtractor)):
             return
         if issubclass(asked_class, PretrainedExtractor):
             try:
-                digest = load_encoder(kwargs["encoder"]).digest
+                hash = load_encoder(kwargs["encoder"]).hash
             except EncoderNotFoundError:
                 absent = True
-        here = _name(asked_class, bool(kwargs.get("freeze", False)), digest)
+        here = _name(asked_class, bool(kwargs.get("freeze", False)), hash)
     extractors = [extractor for _, extractor in find_extractors(model.policy)]
-    there = {_name(type(each), each.frozen, None if absent else each.digest) for each in extractors}
+    there = {_name(type(each), each.frozen, None if absent else each.hash) for each in extractors}
     there = there or {"none of our extractors"}
     if there != {here}:
         raise ValueError(f"it was trained with {' and '.join(sorted(there))}, not with {here}")
 
 
-def _name(extractor: type[EncoderExtractor], frozen: bool, digest: str | None) -> str:
-    return extractor.__name__ + f", digest {digest}" * (digest is not None) + ", frozen" * frozen
+def _name(extractor: type[EncoderExtractor], frozen: bool, hash: str | None) -> str:
+    return extractor.__name__ + f", digest {hash}" * (hash is not None) + ", frozen" * frozen

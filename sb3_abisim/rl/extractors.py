@@ -54,7 +54,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
         mark_encoder(self.encoder)
 
     @property
-    def digest(self) -> str | None:
+    def hash(self) -> str | None:
         """sha256 (hexadecimal) of the encoder file that the weights came from, None if they came from none."""
         return None
 
@@ -63,7 +63,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
         """Number of weights, whether frozen or not."""
         return self.initial_weights.numel()
 
-    def drift(self) -> float:
+    def relative_weight_change(self) -> float:
         """Distance of the weights from those training started with, relative to the norm of the latter."""
         with th.no_grad():
             distance = th.linalg.vector_norm(self._flat_weights() - self.initial_weights)
@@ -97,7 +97,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
 
 
 class VanillaExtractor(EncoderExtractor):
-    """The network without pretraining, the baseline. SB3 initialises and trains it like its own extractors.
+    """The network without pretraining, the baseline. SB3 initializes and trains it like its own extractors.
 
     :param observation_space: uint8 images in 0..255, channels first
     :param network: name of the network; None takes the one made for the observation's shape
@@ -117,7 +117,7 @@ class VanillaExtractor(EncoderExtractor):
         super().__init__(observation_space, make_encoder(observation_space, network, **(network_kwargs or {})))
 
     def apply(self, fn: Any) -> "VanillaExtractor":
-        """As in torch; afterwards drift is measured from the new weights (SB3 initialises through this method).
+        """As in torch; afterwards drift is measured from the new weights (SB3 initializes through this method).
 
         :param fn: called on every submodule
         """
@@ -146,7 +146,7 @@ class PretrainedExtractor(EncoderExtractor):
 
     # 1 once the weights come from an encoder file, directly or through a saved model.
     weights_ready: th.Tensor
-    encoder_digest: th.Tensor
+    encoder_hash: th.Tensor
 
     def __init__(
         self,
@@ -170,19 +170,19 @@ class PretrainedExtractor(EncoderExtractor):
         super().__init__(observation_space, module)
         self.source = encoder
         self.frozen = freeze
-        self.contract = None if file is None else file.contract
+        self.metadata = None if file is None else file.metadata
         self._absence = absence
-        digest = bytes(32) if file is None else bytes.fromhex(file.digest)
+        hash = bytes(32) if file is None else bytes.fromhex(file.hash)
         self.register_buffer("weights_ready", th.tensor(file is not None, dtype=th.uint8))
-        self.register_buffer("encoder_digest", th.tensor(list(digest), dtype=th.uint8))
+        self.register_buffer("encoder_hash", th.tensor(list(hash), dtype=th.uint8))
         if freeze:
             _parameters_to_buffers(self.encoder)
             self.encoder.eval()
 
     @property
-    def digest(self) -> str | None:
+    def hash(self) -> str | None:
         """sha256 (hexadecimal) of the encoder file that the weights came from, None while there are no weights."""
-        return bytes(self.encoder_digest.tolist()).hex() if bool(self.weights_ready) else None
+        return bytes(self.encoder_hash.tolist()).hex() if bool(self.weights_ready) else None
 
     def require_weights(self) -> None:
         """Raise if the encoder file was absent and no saved model has brought the weights since.
@@ -269,7 +269,7 @@ def _check_space(observation_space: gym.Space[Any]) -> None:
         )
     if not is_image_space(observation_space):
         raise ValueError(
-            f"an encoder takes uint8 images in 0..255, got {observation_space}; leave images unnormalised "
+            f"an encoder takes uint8 images in 0..255, got {observation_space}; leave images unnormalized "
             "(VecNormalize(norm_obs=False), in a zoo YAML no `normalize: true`), SB3 divides them by 255"
         )
 
@@ -281,7 +281,7 @@ def check_objective(file: EncoderFile, objective: str) -> None:
     :param objective: short name of the objective that is expected, e.g. "ssi"
     :raises ValueError: with both sides
     """
-    trained_by = file.contract["objective"]
+    trained_by = file.metadata["objective"]
     if trained_by != objective:
         known = methods()
         remedy = (

@@ -25,7 +25,7 @@ def merge_encoder(model: AlgorithmT, encoder: str) -> AlgorithmT:
     the same and can be trained further. Saved, it is complete: it loads where the encoder file is absent.
 
     :param model: of any pixel algorithm, trained on ``VecEncodeObservations``; it is left as it was. A loaded one
-        does not know whether its environment normalised observations: only a model that has it is remerged for that
+        does not know whether its environment normalized observations: only a model that has it is remerged for that
     :param encoder: the encoder file that it was trained on, as for ``VecEncodeObservations``
     :return: a model of the same class without an environment, on the same device
     :raises FileNotFoundError: if there is no such encoder
@@ -37,14 +37,14 @@ def merge_encoder(model: AlgorithmT, encoder: str) -> AlgorithmT:
             f"the model was trained on {model.observation_space}, not on the embeddings of an encoder; "
             "wrap its environment in VecEncodeObservations and train it with MlpPolicy"
         )
-    if model.observation_space.digest != file.digest:
+    if model.observation_space.hash != file.hash:
         raise ValueError(
-            f"the model was trained on the embeddings of the encoder with digest {model.observation_space.digest}, "
-            f"but {file.path} has {file.digest}; give the file that it was trained on"
+            f"the model was trained on the embeddings of the encoder with digest {model.observation_space.hash}, "
+            f"but {file.path} has {file.hash}; give the file that it was trained on"
         )
     normalize = model.get_vec_normalize_env()
     if normalize is not None and normalize.norm_obs:
-        raise ValueError("the model was trained on normalised embeddings; train it with VecNormalize(norm_obs=False)")
+        raise ValueError("the model was trained on normalized embeddings; train it with VecNormalize(norm_obs=False)")
     network = file.encoder.spec()
     # Through the format of a saved model, which knows what belongs to one.
     buffer = io.BytesIO()
@@ -52,9 +52,9 @@ def merge_encoder(model: AlgorithmT, encoder: str) -> AlgorithmT:
     data: Any
     params: Any
     data, params, variables = load_from_zip_file(buffer, device=model.device)
-    data["observation_space"] = space_from_json(file.contract["observation_space"])
+    data["observation_space"] = space_from_json(file.metadata["observation_space"])
     data["policy_kwargs"] |= {
-        "features_extractor_class": extractor_class(file.contract["objective"]),
+        "features_extractor_class": extractor_class(file.metadata["objective"]),
         "features_extractor_kwargs": {
             "encoder": encoder,
             "freeze": True,

@@ -1,4 +1,4 @@
-"""A vectorised environment that shows a frozen encoder's embeddings instead of pictures.
+"""A vectorized environment that shows a frozen encoder's embeddings instead of pictures.
 
 With ``freeze=True`` a features extractor embeds each picture again in every epoch and every update. Here each is
 embedded once, when the environment shows it, and rollouts, replay buffers and updates hold the embeddings.
@@ -28,15 +28,15 @@ class EncodedBox(spaces.Box):
     :param digest: sha256 (hexadecimal) of the encoder file
     """
 
-    def __init__(self, features_dim: int, digest: str) -> None:
+    def __init__(self, features_dim: int, hash: str) -> None:
         super().__init__(-np.inf, np.inf, (features_dim,), np.float32)
-        self.digest = digest
+        self.hash = hash
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, EncodedBox) and self.digest == other.digest and super().__eq__(other)
+        return isinstance(other, EncodedBox) and self.hash == other.hash and super().__eq__(other)
 
     def __repr__(self) -> str:
-        return f"EncodedBox({self.shape[0]}, digest={self.digest!r})"
+        return f"EncodedBox({self.shape[0]}, digest={self.hash!r})"
 
 
 class VecEncodeObservations(VecEnvWrapper):
@@ -68,7 +68,7 @@ class VecEncodeObservations(VecEnvWrapper):
         if objective is not None:
             check_objective(file, objective)
         file.check(venv.observation_space)
-        super().__init__(venv, observation_space=EncodedBox(file.encoder.features_dim, file.digest))
+        super().__init__(venv, observation_space=EncodedBox(file.encoder.features_dim, file.hash))
         self.encoder_file = file
         self.source = encoder
         self._device = get_device(device)

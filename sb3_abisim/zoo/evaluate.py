@@ -24,7 +24,7 @@ from sb3_abisim.zoo.methods import normalizes_observations
 from sb3_abisim.zoo.runs import Run, read_run
 
 FILE_NAME = "final_evaluations.npz"
-MODES = ("deterministic", "sampled")
+MODES = ("deterministic", "stochastic")
 N_ENVS = 16
 # Far from the small numbers that people train with.
 SEED = 1_000_000
@@ -99,7 +99,7 @@ def not_rebuilt(settings: Mapping[str, Any]) -> list[str]:
     :return: names of wrappers; empty where the final evaluation is as training was
     """
     found = [name for name in ("env_wrapper", "frame_stack") if settings.get(name)]
-    # Normalised rewards change nothing of what a model sees.
+    # Normalized rewards change nothing of what a model sees.
     found += ["normalize"] if normalizes_observations(settings.get("normalize")) else []
     wrappers = settings.get("vec_env_wrapper") or []
     for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:

@@ -153,18 +153,18 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         if encoding is not None:
             encoder = encoding["encoder"]
             file = load_encoder(encoder)
-            return MethodRecord(file.contract["objective"], True, encoder, file.digest, preprocessing)
+            return MethodRecord(file.metadata["objective"], True, encoder, file.hash, preprocessing)
         if not (isinstance(extractor, type) and issubclass(extractor, EncoderExtractor)):
             return MethodRecord(None, False, None, None, preprocessing)
         kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
-        encoder, digest = kwargs.get("encoder"), None
+        encoder, hash = kwargs.get("encoder"), None
         if encoder is not None:
             try:
-                digest = load_encoder(encoder).digest
+                hash = load_encoder(encoder).hash
             except EncoderNotFoundError:
                 # A saved model that is continued is complete without it; training a new one is refused later.
-                digest = None
-        return MethodRecord(method_of(extractor), bool(kwargs.get("freeze", False)), encoder, digest, preprocessing)
+                hash = None
+        return MethodRecord(method_of(extractor), bool(kwargs.get("freeze", False)), encoder, hash, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does.

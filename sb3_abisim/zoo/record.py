@@ -77,7 +77,7 @@ def _picture(rendered: Any) -> "Image.Image":
     from PIL import Image
 
     small = Image.fromarray(rendered).resize((PIXELS, PIXELS))
-    # Of Pillow's ways to choose 256 colours this one keeps the red of the small agent.
+    # Of Pillow's ways to choose 256 colors this one keeps the red of the small agent.
     return small.quantize(method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from sb3_abisim.common.vocabulary import current_result
 from sb3_abisim.zoo.methods import MethodRecord, encoding_kwargs
 
 
@@ -125,7 +126,9 @@ class Run:
     def final(self) -> dict[str, NDArray[Any]] | None:
         """What :mod:`sb3_abisim.zoo.evaluate` wrote: ``<mode>/<split>/results`` and so on; None if it did not."""
         path = self.folder / "final_evaluations.npz"
-        return dict(np.load(path, allow_pickle=False)) if path.is_file() else None
+        if not path.is_file():
+            return None
+        return {current_result(name): array for name, array in np.load(path, allow_pickle=False).items()}
 
 
 def _read_curve(path: Path) -> Curve:

@@ -1,4 +1,4 @@
-"""Run one cell: ``python -m sb3_abisim.benchmark.jobs.job`` with the cell as a line of JSON on standard input.
+"""Run one job: ``python -m sb3_abisim.benchmark.jobs.job`` with the job as a line of JSON on standard input.
 
 An engine starts this program, here or on another machine. It holds standard input open: when the engine dies, however
 it dies, the input ends and the command is killed with all that it started, so that no orphan goes on writing.
@@ -23,65 +23,65 @@ from typing import Any
 
 import sb3_abisim
 from sb3_abisim._version import __version__
-from sb3_abisim.benchmark.jobs.source_hash import source_digest
-from sb3_abisim.common.files import FolderLockedError, file_digest, folder_lock, write_atomic
+from sb3_abisim.benchmark.jobs.source_hash import source_hash
+from sb3_abisim.common.files import FolderLockedError, file_hash, folder_lock, write_atomic
 
-# A worker that was lost may take this long to die and to let go of its cell.
+# A worker that was lost may take this long to die and to let go of its job.
 LOCK_PATIENCE_SECONDS = 60.0
 LOG_TAIL_LINES = 15
 
 
-def marker_path(root: Path, name: str) -> Path:
-    """The file that says that a cell is done, and how it came about.
+def manifest_path(root: Path, name: str) -> Path:
+    """The file that says that a job is done, and how it came about.
 
     :param root: the benchmark's folder
-    :param name: of the cell
+    :param name: of the job
     """
-    return root / "cells" / f"{name}.json"
+    return root / "jobs" / f"{name}.json"
 
 
-def is_done(root: Path, cell: dict[str, Any]) -> bool:
+def is_done(root: Path, job: dict[str, Any]) -> bool:
     """Whether the output is there and still what was made.
 
     :param root: the benchmark's folder
-    :param cell: what :meth:`~sb3_abisim.benchmark.plan.Cell.to_json` gave
+    :param job: what :meth:`~sb3_abisim.benchmark.plan.Job.to_json` gave
     """
     try:
-        marker = json.loads(marker_path(root, cell["name"]).read_bytes())
-        return bool(marker["digest"] == file_digest(root / cell["output"] / cell["proof"]))
+        manifest = json.loads(manifest_path(root, job["name"]).read_bytes())
+        return bool(manifest["hash"] == file_hash(root / job["output"] / job["output_file"]))
     except FileNotFoundError:
         return False
 
 
-def is_by_other_code(root: Path, cell: dict[str, Any]) -> bool:
-    """Whether a cell that is done was made by other code than this; False where its marker does not say.
+def is_by_other_code(root: Path, job: dict[str, Any]) -> bool:
+    """Whether a job that is done was made by other code than this; False where its manifest does not say.
 
     :param root: the benchmark's folder
-    :param cell: what :meth:`~sb3_abisim.benchmark.plan.Cell.to_json` gave
+    :param job: what :meth:`~sb3_abisim.benchmark.plan.Job.to_json` gave
     """
-    source = json.loads(marker_path(root, cell["name"]).read_bytes()).get("source")
-    return source is not None and source != source_digest(cell["kind"])
+    source = json.loads(manifest_path(root, job["name"]).read_bytes()).get("source")
+    return source is not None and source != source_hash(job["kind"])
 
 
-class CellError(RuntimeError):
-    """A cell's command failed; the message ends with the last lines of its log."""
+class JobError(RuntimeError):
+    """A job's command failed; the message ends with the last lines of its log."""
 
 
 def launch(
     root: Path,
-    cell: dict[str, Any],
+    job: dict[str, Any],
     threads: int,
     started: Callable[["subprocess.Popen[bytes]"], object] = lambda process: None,
 ) -> None:
-    """Run a cell in a program of its own and wait for its end.
+    """Run a job in a program of its own and wait for its end.
 
     :param root: the benchmark's folder
-    :param cell: what :meth:`~sb3_abisim.benchmark.plan.Cell.to_json` gave
+    :param job: what :meth:`~sb3_abisim.benchmark.plan.Job.to_json` gave
     :param threads: for the command's libraries
     :param started: called with the process, so that it can be stopped
     :raises CellError: when it failed
     """
-    log = root / "logs" / f"{cell['name']}.log"
+    log = root / "logs" / f"{job['name']}.log"
     log.parent.mkdir(exist_ok=True)
     package = str(Path(sb3_abisim.__file__).resolve().parent.parent)
     path = os.pathsep.join(filter(None, [package, os.environ.get("PYTHONPATH")]))
@@ -95,7 +95,7 @@ def launch(
     started(process)
     assert process.stdin is not None
     try:
-        process.stdin.write(json.dumps(cell).encode() + b"\n")
+        process.stdin.write(json.dumps(job).encode() + b"\n")
         process.stdin.flush()
     except BrokenPipeError:
         pass  # it has died already; its status says so
@@ -108,7 +108,7 @@ def launch(
     if code:
         kill(process)
         tail = "\n  ".join(log.read_text(errors="replace").splitlines()[-LOG_TAIL_LINES:])
-        raise CellError(f"{cell['title']} failed (exit status {code}); {log} ends with\n  {tail}")
+        raise JobError(f"{job['title']} failed (exit status {code}); {log} ends with\n  {tail}")
 
 
 def kill(process: "subprocess.Popen[bytes]") -> None:
@@ -122,20 +122,20 @@ def kill(process: "subprocess.Popen[bytes]") -> None:
 
 
 def main() -> None:
-    """Run the cell that standard input names, in the working directory, which is the benchmark's folder."""
+    """Run the job that standard input names, in the working directory, which is the benchmark's folder."""
     line = b""
     while not line.endswith(b"\n"):
-        line += os.read(0, 1 << 16) or sys.exit("the engine died before it named a cell")
-    cell = json.loads(line)
+        line += os.read(0, 1 << 16) or sys.exit("the engine died before it named a job")
+    job = json.loads(line)
     threading.Thread(target=_die_with_engine, daemon=True).start()
     root = Path.cwd()
-    work = root / "work" / cell["name"]
+    work = root / "work" / job["name"]
     work.mkdir(parents=True, exist_ok=True)
     deadline = time.monotonic() + LOCK_PATIENCE_SECONDS
     while True:
         try:
             with folder_lock(work):
-                _run(root, work, cell)
+                _run(root, work, job)
             break
         except FolderLockedError:
             if time.monotonic() > deadline:
@@ -151,43 +151,43 @@ def _die_with_engine() -> None:
     os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
-def _run(root: Path, work: Path, cell: dict[str, Any]) -> None:
-    if is_done(root, cell):
+def _run(root: Path, work: Path, job: dict[str, Any]) -> None:
+    if is_done(root, job):
         return  # by a worker that was thought lost
-    output = root / cell["output"]
+    output = root / job["output"]
     output.parent.mkdir(parents=True, exist_ok=True)
-    if cell["kind"] == "run":
+    if job["kind"] == "run":
         if output.exists():
             raise ValueError(f"{output} is there, but not as it was made; move it away, then run the command again")
         # The zoo cannot go on where it was killed.
         for leftover in work.iterdir():
             if leftover.is_dir():
                 shutil.rmtree(leftover)
-    if cell["kind"] == "encoder" and output.is_file() and marker_path(root, cell["name"]).is_file():
+    if job["kind"] == "encoder" and output.is_file() and manifest_path(root, job["name"]).is_file():
         # Not as it was made; pretraining would find it finished and refuse it.
         damaged = output.with_suffix(".damaged")
         output.rename(damaged)
         print(f"{output} is not as it was made; it is now {damaged}", flush=True)
-    start, source = time.monotonic(), source_digest(cell["kind"])
-    print(f"$ python -m {' '.join(cell['command'])}", flush=True)
-    code = subprocess.run([sys.executable, "-m", *cell["command"]], stdin=subprocess.DEVNULL).returncode
+    start, source = time.monotonic(), source_hash(job["kind"])
+    print(f"$ python -m {' '.join(job['command'])}", flush=True)
+    code = subprocess.run([sys.executable, "-m", *job["command"]], stdin=subprocess.DEVNULL).returncode
     if code:
         sys.exit(code if code > 0 else 1)
-    made = next(work.glob(f"*/{cell['settings']['env_id']}_1")) if cell["kind"] == "run" else output
+    made = next(work.glob(f"*/{job['settings']['env_id']}_1")) if job["kind"] == "run" else output
     content = {
-        **cell,
-        "digest": file_digest(made / cell["proof"]),
+        **job,
+        "hash": file_hash(made / job["output_file"]),
         "seconds": round(time.monotonic() - start, 1),
         "source": source,
         "host": socket.gethostname(),
         "versions": {"sb3_abisim": __version__, "python": platform.python_version(), **_versions()},
         "hardware": hardware(),
     }
-    marker = marker_path(root, cell["name"])
-    marker.parent.mkdir(exist_ok=True)
-    write_atomic(marker, lambda file: file.write(json.dumps(content, indent=1).encode()))
+    manifest = manifest_path(root, job["name"])
+    manifest.parent.mkdir(exist_ok=True)
+    write_atomic(manifest, lambda file: file.write(json.dumps(content, indent=1).encode()))
     if made != output:
-        # After the marker: a kill in between leaves no folder that would stand in the way.
+        # After the manifest: a kill in between leaves no folder that would stand in the way.
         made.rename(output)
 
 

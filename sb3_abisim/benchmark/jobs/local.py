@@ -1,4 +1,4 @@
-"""Run the cells of a benchmark: what is missing, each as soon as its inputs are there, with one display over all."""
+"""Run the jobs of a benchmark: what is missing, each as soon as its inputs are there, with one display over all."""
 
 import json
 import math
@@ -17,8 +17,8 @@ import numpy as np
 from tqdm import tqdm
 
 from sb3_abisim._version import __version__
-from sb3_abisim.benchmark.jobs.job import is_by_other_code, is_done, kill, launch, marker_path
-from sb3_abisim.benchmark.plan import Cell
+from sb3_abisim.benchmark.jobs.job import is_by_other_code, is_done, kill, launch, manifest_path
+from sb3_abisim.benchmark.plan import Job
 from sb3_abisim.common.files import folder_lock
 
 REFRESH_SECONDS = 1.0
@@ -29,15 +29,15 @@ _N_NAMED = 5
 
 
 class Engine(Protocol):
-    """Where cells run.
+    """Where jobs run.
 
     ``n_slots`` is how many of them run at a time.
     """
 
     n_slots: int
 
-    def submit(self, root: Path, cell: Cell) -> "Future[None]":
-        """Run a cell; the future raises :class:`~sb3_abisim.benchmark.jobs.job.CellError` when it fails."""
+    def submit(self, root: Path, job: Job) -> "Future[None]":
+        """Run a job; the future raises :class:`~sb3_abisim.benchmark.jobs.job.CellError` when it fails."""
 
     def close(self) -> None:
         """Stop what runs, if anything does, and let go of all resources."""
@@ -46,7 +46,7 @@ class Engine(Protocol):
 class LocalEngine:
     """Processes on this machine.
 
-    :param n_jobs: cells at a time
+    :param n_jobs: jobs at a time
     :param threads: of each
     """
 
@@ -58,9 +58,9 @@ class LocalEngine:
         self._processes: list[subprocess.Popen[bytes]] = []
         self._lock, self._closed = threading.Lock(), False
 
-    def submit(self, root: Path, cell: Cell) -> "Future[None]":
-        """Run a cell in a program of its own."""
-        return self._pool.submit(launch, root, cell.to_json(), self.threads, self._started)
+    def submit(self, root: Path, job: Job) -> "Future[None]":
+        """Run a job in a program of its own."""
+        return self._pool.submit(launch, root, job.to_json(), self.threads, self._started)
 
     def _started(self, process: "subprocess.Popen[bytes]") -> None:
         with self._lock:
@@ -79,33 +79,33 @@ class LocalEngine:
         self._pool.shutdown()
 
 
-def run_cells(root: Path, cells: Sequence[Cell], engine: Engine, progress: bool = True) -> dict[str, str]:
-    """Run the cells that are not done; one that fails takes with it only what depends on it.
+def run_jobs(root: Path, jobs: Sequence[Job], engine: Engine, progress: bool = True) -> dict[str, str]:
+    """Run the jobs that are not done; one that fails takes with it only what depends on it.
 
     :param root: the benchmark's folder; it is created
-    :param cells: inputs before what needs them
+    :param jobs: inputs before what needs them
     :param engine: where; it is closed at the end
     :param progress: show the display on standard error
-    :return: title to error of the cells that failed; empty when all are done
+    :return: title to error of the jobs that failed; empty when all are done
     :raises FolderLockedError: when another benchmark writes in the folder
     """
     root.mkdir(parents=True, exist_ok=True)
     try:
         with folder_lock(root):
-            return _Run(root, cells, engine, progress).run()
+            return _Run(root, jobs, engine, progress).run()
     finally:
         engine.close()
 
 
 class _Run:
-    def __init__(self, root: Path, cells: Sequence[Cell], engine: Engine, progress: bool) -> None:
-        self.root, self.cells, self.engine, self.progress = root, cells, engine, progress
-        self.done = {cell.name for cell in cells if is_done(root, cell.to_json())}
-        self.running: dict[Future[None], tuple[Cell, float]] = {}
-        self.waiting = [cell for cell in cells if cell.name not in self.done]
+    def __init__(self, root: Path, jobs: Sequence[Job], engine: Engine, progress: bool) -> None:
+        self.root, self.jobs, self.engine, self.progress = root, jobs, engine, progress
+        self.done = {job.name for job in jobs if is_done(root, job.to_json())}
+        self.running: dict[Future[None], tuple[Job, float]] = {}
+        self.waiting = [job for job in jobs if job.name not in self.done]
         self.errors: dict[str, str] = {}
         self.failed: set[str] = set()
-        self.rates = _measured_rates(root, cells)
+        self.rates = _measured_rates(root, jobs)
         self.bar = tqdm(
             total=1.0, disable=not progress, bar_format="{percentage:3.0f}%|{bar:20}| {desc}", mininterval=0
         )
@@ -125,106 +125,106 @@ class _Run:
         finally:
             self.bar.close()
         if self.progress:
-            state = f"{len(self.done)} of {len(self.cells)} cells done, {n_kept} of them before"
+            state = f"{len(self.done)} of {len(self.jobs)} jobs done, {n_kept} of them before"
             print(f"{state}; {len(self.errors)} failed", file=sys.stderr)
         return self.errors
 
     def _warn_of_other_code(self) -> None:
-        kept = [cell for cell in self.cells if cell.name in self.done]
-        titles = [cell.title for cell in kept if is_by_other_code(self.root, cell.to_json())]
+        kept = [job for job in self.jobs if job.name in self.done]
+        titles = [job.title for job in kept if is_by_other_code(self.root, job.to_json())]
         if titles:
             names = ", ".join(titles[:_N_NAMED]) + (f" and {len(titles) - _N_NAMED} more" if titles[_N_NAMED:] else "")
-            what = f"{len(titles)} of {len(self.cells)} cells were made by other code of version {__version__}"
+            what = f"{len(titles)} of {len(self.jobs)} jobs were made by other code of version {__version__}"
             print(f"warning: {what} and are kept: {names}; take another folder to make all anew", file=sys.stderr)
 
     def _submit_ready(self) -> None:
-        for cell in list(self.waiting):
-            names = {source.name for source in cell.inputs}
+        for job in list(self.waiting):
+            names = {source.name for source in job.inputs}
             if names & self.failed:
-                self.failed.add(cell.name)
-                self.waiting.remove(cell)
+                self.failed.add(job.name)
+                self.waiting.remove(job)
             elif names <= self.done and len(self.running) < self.engine.n_slots:
-                self.running[self.engine.submit(self.root, cell)] = (cell, time.monotonic())
-                self.waiting.remove(cell)
+                self.running[self.engine.submit(self.root, job)] = (job, time.monotonic())
+                self.waiting.remove(job)
 
     def _finish(self, future: "Future[None]") -> None:
-        cell, start = self.running.pop(future)
+        job, start = self.running.pop(future)
         error = future.exception()
         if error is None:
-            self.done.add(cell.name)
-            self.rates[_rate_name(cell)] = (time.monotonic() - start) / cell.units
+            self.done.add(job.name)
+            self.rates[_rate_name(job)] = (time.monotonic() - start) / job.cost
         elif isinstance(error, Exception):
-            self.failed.add(cell.name)
-            self.errors[cell.title] = str(error)
-            tqdm.write(f"{cell.title} failed: {error}", file=sys.stderr)
+            self.failed.add(job.name)
+            self.errors[job.title] = str(error)
+            tqdm.write(f"{job.title} failed: {error}", file=sys.stderr)
         else:
             raise error
 
     def _show(self) -> None:
         now, left, spent = time.monotonic(), 0.0, 0.0
-        for cell, start in self.running.values():
-            share = done_share(self.root, cell)
+        for job, start in self.running.values():
+            share = done_share(self.root, job)
             if share > 0.02:
-                self.rates[_rate_name(cell)] = (now - start) / share / cell.units
+                self.rates[_rate_name(job)] = (now - start) / share / job.cost
             else:
                 # It leaves no trace yet. One that takes longer than expected is never taken for done.
-                share = min(0.9, (now - start) / self._seconds(cell))
-            left += self._seconds(cell) * (1 - share)
-            spent += self._seconds(cell) * share
-        left += sum(self._seconds(cell) for cell in self.waiting)
-        spent += sum(self._seconds(cell) for cell in self.cells if cell.name in self.done)
+                share = min(0.9, (now - start) / self._seconds(job))
+            left += self._seconds(job) * (1 - share)
+            spent += self._seconds(job) * share
+        left += sum(self._seconds(job) for job in self.waiting)
+        spent += sum(self._seconds(job) for job in self.jobs if job.name in self.done)
         self.bar.n = spent / (spent + left) if spent + left else 1.0
         slots = max(1, min(self.engine.n_slots, len(self.running) + len(self.waiting)))
         hours, minutes = divmod(math.ceil(left / slots / 60), 60)
         clock = f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
-        names = ", ".join(cell.title for cell, _ in list(self.running.values())[:2])
-        state = f"{len(self.done)}/{len(self.cells)} cells, about {clock} left"
+        names = ", ".join(job.title for job, _ in list(self.running.values())[:2])
+        state = f"{len(self.done)}/{len(self.jobs)} jobs, about {clock} left"
         more = f", +{len(self.running) - 2}" if len(self.running) > 2 else ""
         self.bar.set_description_str(f"{state}; {names}{more}" if names else state)
 
-    def _seconds(self, cell: Cell) -> float:
-        rate = self.rates.get(_rate_name(cell))
-        return _START_SECONDS + cell.units * _FIRST_GUESS[cell.kind] if rate is None else cell.units * rate
+    def _seconds(self, job: Job) -> float:
+        rate = self.rates.get(_rate_name(job))
+        return _START_SECONDS + job.cost * _FIRST_GUESS[job.kind] if rate is None else job.cost * rate
 
 
-def _rate_name(cell: Cell) -> str:
-    """Cells of one name take about equally long per unit."""
-    source = cell.inputs[0] if cell.kind == "final" else cell
+def _rate_name(job: Job) -> str:
+    """Jobs of one name take about equally long per unit."""
+    source = job.inputs[0] if job.kind == "final" else job
     name = source.settings.get("objective", source.settings.get("algo", ""))
-    return f"{cell.kind} {source.settings['env_id']} {name}"
+    return f"{job.kind} {source.settings['env_id']} {name}"
 
 
-def _measured_rates(root: Path, cells: Sequence[Cell]) -> dict[str, float]:
+def _measured_rates(root: Path, jobs: Sequence[Job]) -> dict[str, float]:
     rates = {}
-    for cell in cells:
-        path = marker_path(root, cell.name)
+    for job in jobs:
+        path = manifest_path(root, job.name)
         if path.is_file():
-            rates[_rate_name(cell)] = json.loads(path.read_bytes())["seconds"] / cell.units
+            rates[_rate_name(job)] = json.loads(path.read_bytes())["seconds"] / job.cost
     return rates
 
 
-def done_share(root: Path, cell: Cell) -> float:
-    """How much of a running cell is done, from what it has written.
+def done_share(root: Path, job: Job) -> float:
+    """How much of a running job is done, from what it has written.
 
     :param root: the benchmark's folder
-    :param cell: one that runs
+    :param job: one that runs
     :return: 0 to 1; 0 where it leaves no trace
     """
     try:
-        if cell.kind == "encoder":
-            lines = (root / cell.output).with_suffix(".run").joinpath("progress.csv").read_text().splitlines()
-            column = lines[0].split(",").index("time/n_updates")
-            return min(1.0, float(lines[-1].split(",")[column]) / cell.units)
-        if cell.kind == "run":
-            (path,) = (root / "work" / cell.name).glob("*/*/evaluations.npz")
-            return min(1.0, float(np.load(path)["timesteps"][-1]) / cell.units)
+        if job.kind == "encoder":
+            lines = (root / job.output).with_suffix(".run").joinpath("progress.csv").read_text().splitlines()
+            column = lines[0].split(",").index("train/n_updates")
+            return min(1.0, float(lines[-1].split(",")[column]) / job.cost)
+        if job.kind == "run":
+            (path,) = (root / "work" / job.name).glob("*/*/evaluations.npz")
+            return min(1.0, float(np.load(path)["timesteps"][-1]) / job.cost)
     except (OSError, ValueError, IndexError, EOFError, zipfile.BadZipFile):
         pass  # not begun, or read while it was written
     return 0.0
 
 
 def default_jobs(threads: int) -> int:
-    """As many cells as the processors that this process may use have room for.
+    """As many jobs as the processors that this process may use have room for.
 
     :param threads: of each
     """
@@ -235,7 +235,7 @@ def make_engine(name: str, n_jobs: int | None, threads: int, **ray_options: Any)
     """The engine of a name.
 
     :param name: "local" or "ray"
-    :param n_jobs: cells at a time; None for as many as there is room for
+    :param n_jobs: jobs at a time; None for as many as there is room for
     :param threads: of each
     :param ray_options: more arguments of :class:`~sb3_abisim.benchmark.jobs.ray.RayEngine`
     :raises ValueError: for another name

@@ -1,7 +1,7 @@
-"""Run the cells of a benchmark on a Ray cluster: the same cells, in programs of their own on its nodes.
+"""Run the jobs of a benchmark on a Ray cluster: the same jobs, in programs of their own on its nodes.
 
 The benchmark's folder must be a shared one, at the same path on every node, and the nodes must have this version of the
-package. Ray starts a cell anew, on another node, when it has lost the worker that ran it.
+package. Ray starts a job anew, on another node, when it has lost the worker that ran it.
 """
 
 import logging
@@ -13,22 +13,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_abisim._version import __version__
-from sb3_abisim.benchmark.jobs.job import CellError, launch
+from sb3_abisim.benchmark.jobs.job import JobError, launch
 from sb3_abisim.common.files import write_atomic
 
 if TYPE_CHECKING:
-    from sb3_abisim.benchmark.plan import Cell  # at run time it would load PyTorch into each of Ray's workers
+    from sb3_abisim.benchmark.plan import Job  # at run time it would load PyTorch into each of Ray's workers
 
 
 class RayEngine:
-    """Cells as Ray tasks.
+    """Jobs as Ray tasks.
 
-    :param n_jobs: cells at a time; None for as many as the cluster has processors for
-    :param threads: of each cell, which asks for as many processors
+    :param n_jobs: jobs at a time; None for as many as the cluster has processors for
+    :param threads: of each job, which asks for as many processors
     :param address: of the cluster, ``host:port`` or "auto" for the one of this machine
-    :param gpus: per cell; a part of one is shared
-    :param retries: how often a cell is started anew after a lost worker
-    :raises ValueError: if Ray is not installed, there is no cluster, or it has too little for one cell
+    :param gpus: per job; a part of one is shared
+    :param retries: how often a job is started anew after a lost worker
+    :raises ValueError: if Ray is not installed, there is no cluster, or it has too little for one job
     """
 
     def __init__(
@@ -47,24 +47,24 @@ class RayEngine:
             raise ValueError(f"no Ray cluster at {address!r} ({error}); start one with: ray start --head") from error
         nodes: list[dict[str, float]] = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         room = 0
-        for node in nodes:  # a cell does not lie on two
+        for node in nodes:  # a job does not lie on two
             fitting = int(node.get("CPU", 0) // threads)
             room += min(fitting, int(node.get("GPU", 0) / gpus)) if gpus else fitting
         if room < 1:
             ray.shutdown()
-            raise ValueError(f"no node has room for a cell of {threads} processors and {gpus} GPUs: {nodes}")
+            raise ValueError(f"no node has room for a job of {threads} processors and {gpus} GPUs: {nodes}")
         self.n_slots, self.threads = room if n_jobs is None else n_jobs, threads
         self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": retries}
 
-    def submit(self, root: Path, cell: "Cell") -> "Future[None]":
-        """Hand a cell to the cluster."""
+    def submit(self, root: Path, job: "Job") -> "Future[None]":
+        """Hand a job to the cluster."""
         root = root.resolve()
         token = root / "shared_folder"
         if not token.is_file():
             text = f"{socket.gethostname()} {os.getpid()} {time.time()}"
             write_atomic(token, lambda file: file.write(text.encode()))
-        task = self._ray.remote(_execute).options(name=cell.title, **self._options)
-        reference = task.remote(str(root), token.read_text(), __version__, cell.to_json(), self.threads)
+        task = self._ray.remote(_execute).options(name=job.title, **self._options)
+        reference = task.remote(str(root), token.read_text(), __version__, job.to_json(), self.threads)
         future: Future[None] = reference.future()
         return future
 
@@ -73,12 +73,12 @@ class RayEngine:
         self._ray.shutdown()
 
 
-def _execute(root: str, token: str, version: str, cell: dict[str, Any], threads: int) -> None:
+def _execute(root: str, token: str, version: str, job: dict[str, Any], threads: int) -> None:
     """On a node: refuse what would go wrong later, then do as everywhere else."""
     host = socket.gethostname()
     if version != __version__:
-        raise CellError(f"{host} has sb3_abisim {__version__}, this benchmark runs with {version}; install that one")
+        raise JobError(f"{host} has sb3_abisim {__version__}, this benchmark runs with {version}; install that one")
     path = Path(root) / "shared_folder"
     if not path.is_file() or path.read_text() != token:
-        raise CellError(f"{root} is not the benchmark's folder on {host}; give a folder that all nodes share")
-    launch(Path(root), cell, threads)
+        raise JobError(f"{root} is not the benchmark's folder on {host}; give a folder that all nodes share")
+    launch(Path(root), job, threads)

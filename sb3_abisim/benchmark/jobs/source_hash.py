@@ -1,8 +1,8 @@
-"""What code made a cell, so that cells made by other code of the same version can be named.
+"""What code made a job, so that jobs made by other code of the same version can be named.
 
-A cell's name holds the package's version and not its source: a released version is one thing, and in a checkout every
-changed comment would otherwise cost days of training. Instead each cell's marker records a digest of the source that
-made it. Cells that are found with another digest are kept and named in a warning; whoever changed the code knows
+A job's name holds the package's version and not its source: a released version is one thing, and in a checkout every
+changed comment would otherwise cost days of training. Instead each job's manifest records a digest of the source that
+made it. Jobs that are found with another digest are kept and named in a warning; whoever changed the code knows
 whether they still hold, and takes another folder if not.
 """
 
@@ -20,19 +20,19 @@ _FINAL = "benchmark/evaluate.py"
 
 
 @functools.cache
-def source_digest(kind: str, package: Path = PACKAGE) -> str:
-    """The sha256 of the source that determines what cells of a kind make, comments included.
+def source_hash(kind: str, package: Path = PACKAGE) -> str:
+    """The sha256 of the source that determines what jobs of a kind make, comments included.
 
-    Hyperparameters are not part of it: they are settings, and so part of the cells' names.
+    Hyperparameters are not part of it: they are settings, and so part of the jobs' names.
 
     :param kind: "data", "encoder", "run" or "final"
     :param package: its folder
     """
-    digest = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for path in sorted([*package.rglob("*.py"), *package.glob("media/*.npz")]):
         name = path.relative_to(package).as_posix()
         part = name.partition("/")[0]
         counts = part in _COLLECTION if kind == "data" else part not in _READERS
         if counts or (kind == "final" and name == _FINAL):
-            digest.update(f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
-    return digest.hexdigest()
+            sha256.update(f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return sha256.hexdigest()

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart, and two more for whatever else is compared.
+# Okabe and Ito's palette, which color-blind readers can tell apart, and two more for whatever else is compared.
 PALETTE = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F",
 )  # fmt: skip
-GREY = "#6b7280"
+GRAY = "#6b7280"
 DPI = 150
 MINUS = "\N{MINUS SIGN}"
 SPLIT_NAMES = {"eval": "unseen clips", "train": "clips seen in training", "clean": "no clips"}
@@ -27,13 +27,13 @@ _STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.edgecolor": GREY,
+    "axes.edgecolor": GRAY,
     "axes.labelcolor": "#374151",
     "axes.titlesize": 11,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
-    "xtick.color": GREY,
-    "ytick.color": GREY,
+    "xtick.color": GRAY,
+    "ytick.color": GRAY,
     "axes.grid": True,
     "grid.color": "#e5e7eb",
     "axes.axisbelow": True,
@@ -63,7 +63,7 @@ def draw(comparison: Comparison) -> dict[str, bytes]:
 
     labels = list(dict.fromkeys(label for methods in comparison.groups.values() for label in methods))
     labels.sort(key=lambda label: label != comparison.reference)
-    colours = assign_colours(labels)
+    colors = assign_colors(labels)
     pictures = {}
     functions = {
         "curves": _curves, "thresholds": _thresholds, "splits": _splits, "aggregates": _aggregates,
@@ -71,7 +71,7 @@ def draw(comparison: Comparison) -> dict[str, bytes]:
     }  # fmt: skip
     with plt.rc_context(_STYLE):
         for name, function in functions.items():
-            figure = function(comparison, colours)
+            figure = function(comparison, colors)
             if figure is not None:
                 buffer = io.BytesIO()
                 # Without it the file holds matplotlib's version, and equal reports would differ.
@@ -81,11 +81,11 @@ def draw(comparison: Comparison) -> dict[str, bytes]:
     return pictures
 
 
-def assign_colours(labels: Sequence[str]) -> dict[str, str]:
-    """To each method the same colour in every report; variants of a method, and others, take what is left.
+def assign_colors(labels: Sequence[str]) -> dict[str, str]:
+    """To each method the same color in every report; variants of a method, and others, take what is left.
 
     :param labels: of the methods, the reference first
-    :return: label to colour
+    :return: label to color
     """
     known = methods()
     names = [re.split("[=,]", label)[0] for label in labels]
@@ -96,7 +96,7 @@ def assign_colours(labels: Sequence[str]) -> dict[str, str]:
     return {label: own.pop(method) if method in own else next(spare) for label, method in pairs}
 
 
-def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
+def _curves(comparison: Comparison, colors: dict[str, str]) -> "Figure":
     import matplotlib.pyplot as plt
 
     n = len(comparison.groups)
@@ -107,8 +107,10 @@ def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
             rows = [row for row in comparison.curves if (row["env_id"], row["method"]) == (env_id, label)]
             steps, mean, low, high = (np.array([row[key] for row in rows]) for key in ("steps", "mean", "low", "high"))
             width = 2.4 if label == comparison.reference else 1.6
-            axis.plot(steps, mean, color=colours[label], lw=width, label=label, marker="o" if len(steps) == 1 else None)
-            axis.fill_between(steps, low, high, color=colours[label], alpha=0.18, lw=0)
+            axis.plot(
+                steps, mean, color=colors[label], lw=width, label=label, manifest="o" if len(steps) == 1 else None
+            )
+            axis.fill_between(steps, low, high, color=colors[label], alpha=0.18, lw=0)
         _show_possible(axis, next(iter(methods.values())))
         axis.set(title=env_id, xlabel="environment steps")
         axis.xaxis.set_major_formatter(_short_number)
@@ -116,9 +118,9 @@ def _curves(comparison: Comparison, colours: dict[str, str]) -> "Figure":
     axes[0, 0].set_ylabel("return")
     handles = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     # About 0.7 inches for an entry's line and 0.1 for each letter; what does not fit into one row takes several.
-    per_row = int(figure.get_figwidth() / (0.7 + 0.1 * max(map(len, colours))))
-    ncols = max(1, min(per_row, len(colours)))
-    figure.legend([handles[name] for name in colours], list(colours), loc="outside lower center", ncols=ncols)
+    per_row = int(figure.get_figwidth() / (0.7 + 0.1 * max(map(len, colors))))
+    ncols = max(1, min(per_row, len(colors)))
+    figure.legend([handles[name] for name in colors], list(colors), loc="outside lower center", ncols=ncols)
     return figure
 
 
@@ -135,8 +137,8 @@ def _short_number(value: float, _: int = 0) -> str:
     return f"{value:g}"
 
 
-def _thresholds(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
-    rows = [row for row in comparison.thresholds if np.isfinite(row["ratio"]) and row["baseline"] in colours]
+def _thresholds(comparison: Comparison, colors: dict[str, str]) -> "Figure | None":
+    rows = [row for row in comparison.thresholds if np.isfinite(row["ratio"]) and row["baseline"] in colors]
     rows = [row for row in rows if row["baseline"] != comparison.reference]
     if not rows:
         return None
@@ -149,8 +151,8 @@ def _thresholds(comparison: Comparison, colours: dict[str, str]) -> "Figure | No
     for axis, env_id in zip(axes[0], env_ids, strict=True):
         shown = [row for row in rows if row["env_id"] == env_id]
         for y, row in enumerate(shown):
-            _interval(axis, y, row["ratio"], row["low"], row["high"], colours[row["baseline"]], row["bound"])
-        axis.axvline(1, color=GREY, lw=1)
+            _interval(axis, y, row["ratio"], row["low"], row["high"], colors[row["baseline"]], row["bound"])
+        axis.axvline(1, color=GRAY, lw=1)
         ends = [" (its end)" if row["threshold"] == row["baseline"] else "" for row in shown]
         names = [
             f"{row['baseline']}, return {level_text(row['return'])}{end}" for row, end in zip(shown, ends, strict=True)
@@ -173,14 +175,14 @@ def _log_limits(values: Sequence[float]) -> tuple[float, float]:
     return min(0.45, 0.85 * min(finite)), max(2.2, 1.15 * max(finite))
 
 
-def _interval(axis: "Axes", y: float, value: float, low: float, high: float, colour: str, bound: str = "") -> None:
+def _interval(axis: "Axes", y: float, value: float, low: float, high: float, color: str, bound: str = "") -> None:
     if np.isfinite(low):
-        axis.plot([low, high], [y, y], color=colour, lw=3, alpha=0.35, solid_capstyle="round")
+        axis.plot([low, high], [y, y], color=color, lw=3, alpha=0.35, solid_capstyle="round")
     # A hollow mark: a bound, not an estimate.
-    axis.plot([value], [y], "o", color=colour, ms=7, mfc="white" if bound else colour, mew=2)
+    axis.plot([value], [y], "o", color=color, ms=7, mfc="white" if bound else color, mew=2)
 
 
-def _splits(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+def _splits(comparison: Comparison, colors: dict[str, str]) -> "Figure | None":
     rows = [row for row in comparison.final if row["split"] in SPLIT_NAMES and row["mode"] == "deterministic"]
     if not rows:
         return None
@@ -189,14 +191,12 @@ def _splits(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
     env_ids = list(dict.fromkeys(row["env_id"] for row in rows))
     figure, axes = plt.subplots(1, len(env_ids), figsize=(max(6.4, 5.6 * len(env_ids)), 4), squeeze=False)
     for axis, env_id in zip(axes[0], env_ids, strict=True):
-        labels = [label for label in colours if any((r["env_id"], r["method"]) == (env_id, label) for r in rows)]
+        labels = [label for label in colors if any((r["env_id"], r["method"]) == (env_id, label) for r in rows)]
         for i, label in enumerate(labels):
             found = {r["split"]: r for r in rows if (r["env_id"], r["method"]) == (env_id, label)}
             x = [list(SPLIT_NAMES).index(split) + 0.7 * ((i + 0.5) / len(labels) - 0.5) for split in found]
             means, halves = ([r[key] for r in found.values()] for key in ("mean", "half_width"))
-            axis.errorbar(
-                x, means, yerr=np.nan_to_num(halves), fmt="o", ms=7, lw=2.5, color=colours[label], label=label
-            )
+            axis.errorbar(x, means, yerr=np.nan_to_num(halves), fmt="o", ms=7, lw=2.5, color=colors[label], label=label)
         for line in (0.5, 1.5):
             axis.axvline(line, color="#e5e7eb", lw=1)
         axis.set_xticks(range(3), list(SPLIT_NAMES.values()))
@@ -207,22 +207,22 @@ def _splits(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
     return figure
 
 
-def _aggregates(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+def _aggregates(comparison: Comparison, colors: dict[str, str]) -> "Figure | None":
     titles = {"final": "IQM of the final score", "area": "IQM of the score over all of training"}
-    return _forest(comparison.aggregates, "score", titles, ("method", "iqm"), colours, "normalised return")
+    return _forest(comparison.aggregates, "score", titles, ("method", "iqm"), colors, "normalized return")
 
 
-def _improvement(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+def _improvement(comparison: Comparison, colors: dict[str, str]) -> "Figure | None":
     rows = [{**row, "all": "all"} for row in comparison.improvement]
     title = {"all": f"Probability that {comparison.reference} ends higher than"}
-    figure = _forest(rows, "all", title, ("baseline", "probability"), colours, "probability")
+    figure = _forest(rows, "all", title, ("baseline", "probability"), colors, "probability")
     if figure is not None:
-        figure.axes[0].axvline(0.5, color=GREY, lw=1)
+        figure.axes[0].axvline(0.5, color=GRAY, lw=1)
     return figure
 
 
 def _forest(
-    rows: list[Row], panel_key: str, titles: dict[str, str], keys: tuple[str, str], colours: dict[str, str], unit: str
+    rows: list[Row], panel_key: str, titles: dict[str, str], keys: tuple[str, str], colors: dict[str, str], unit: str
 ) -> "Figure | None":
     """Values with intervals below each other; a panel for each value of ``panel_key``."""
     if not rows:
@@ -235,26 +235,26 @@ def _forest(
     for axis, (panel, title) in zip(axes[0], titles.items(), strict=True):
         shown = [row for row in rows if row[panel_key] == panel]
         for y, row in enumerate(shown):
-            _interval(axis, y, row[value], row["low"], row["high"], colours[row[name]])
+            _interval(axis, y, row[value], row["low"], row["high"], colors[row[name]])
         axis.set_yticks(range(len(shown)), [row[name] for row in shown])
         axis.set(title=title, xlim=(-0.02, 1.02), ylim=(len(shown) - 0.4, -0.6), xlabel=unit)
         axis.grid(axis="y", visible=False)
     return figure
 
 
-def _profiles(comparison: Comparison, colours: dict[str, str]) -> "Figure | None":
+def _profiles(comparison: Comparison, colors: dict[str, str]) -> "Figure | None":
     if not comparison.profiles:
         return None
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(6.4, 4))
-    for label, colour in reversed(colours.items()):
+    for label, color in reversed(colors.items()):
         rows = [row for row in comparison.profiles if row["method"] == label]
         columns: list[Any] = [[row[key] for row in rows] for key in ("score", "share", "low", "high")]
-        axis.plot(columns[0], columns[1], color=colour, lw=2, label=label)
-        axis.fill_between(columns[0], columns[2], columns[3], color=colour, alpha=0.18, lw=0)
+        axis.plot(columns[0], columns[1], color=color, lw=2, label=label)
+        axis.fill_between(columns[0], columns[2], columns[3], color=color, alpha=0.18, lw=0)
     axis.set(
-        xlabel="normalised return of the final model", ylabel="share of runs above it", xlim=(0, 1), ylim=(-0.02, 1.02)
+        xlabel="normalized return of the final model", ylabel="share of runs above it", xlim=(0, 1), ylim=(-0.02, 1.02)
     )
     axis.legend(*(reversed(part) for part in axis.get_legend_handles_labels()), loc="upper right")
     return figure

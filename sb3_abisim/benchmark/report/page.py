@@ -37,7 +37,7 @@ def report(
     :param source: "evaluations" or "training"
     :param reference: label of the method that the others are compared with; None takes abisim (or
         abisim,frozen), else the first
-    :param thresholds: normalised returns, or methods whose last return is meant; None for the usual ones
+    :param thresholds: normalized returns, or methods whose last return is meant; None for the usual ones
     :param seed: of the bootstrap
     :return: the page
     :raises ValueError: if the runs cannot be compared

@@ -144,7 +144,7 @@ Interval = tuple[float, float, float]
 def iqm(scores: dict[str, Floats], seed: int = 0) -> dict[str, Interval]:
     """Interquartile mean over runs and environments with its stratified bootstrap interval (rliable).
 
-    :param scores: method to normalised scores, shape (n_runs, n_envs)
+    :param scores: method to normalized scores, shape (n_runs, n_envs)
     :param seed: of the resamples
     :return: method to (value, low, high)
     """

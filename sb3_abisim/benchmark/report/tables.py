@@ -53,7 +53,7 @@ class Group:
     low: float
     high: float
 
-    def normalised(self, returns: Any) -> Any:
+    def normalized(self, returns: Any) -> Any:
         """Returns as shares of the way from ``low`` to ``high``."""
         return (returns - self.low) / (self.high - self.low)
 
@@ -69,7 +69,7 @@ class Group:
         try:
             return "deterministic/last evaluation", np.array([run.evaluations().returns[-1] for run in self.runs])
         except ValueError:
-            return "sampled/end of training", np.array([curve.returns[-1] for curve in self.curves])
+            return "stochastic/end of training", np.array([curve.returns[-1] for curve in self.curves])
 
     def end(self) -> float:
         """Mean over runs of where their curves end, as :func:`~statistics.steps_to_threshold` measures arrival."""
@@ -116,7 +116,7 @@ def compare(
     :param folders: each a folder, or ``LABEL=FOLDER`` to call all runs below it LABEL
     :param source: "evaluations" (the zoo's, during training) or "training" (the training episodes themselves)
     :param reference: label of the method to compare with the others; None takes abisim, frozen or not, else the first
-    :param thresholds: normalised returns, between 0 and 1, or labels: the mean return that this method ends with; None
+    :param thresholds: normalized returns, between 0 and 1, or labels: the mean return that this method ends with; None
         takes 0.5, 0.7, 0.9 and, where there are such runs, vanilla
     :param seed: of the bootstrap
     :raises ValueError: if the runs cannot be compared, with the remedy
@@ -125,8 +125,8 @@ def compare(
         raise ValueError(f"source must be 'evaluations' or 'training', got {source!r}")
     bad = [value for value in thresholds or () if not isinstance(value, str) and not 0 < value <= 1]
     if bad or (thresholds is not None and not thresholds):
-        raise ValueError(f"thresholds are methods, or normalised returns above 0 and up to 1, got {bad}")
-    runs = _labelled_runs(folders)
+        raise ValueError(f"thresholds are methods, or normalized returns above 0 and up to 1, got {bad}")
+    runs = _labeled_runs(folders)
     labels = list(dict.fromkeys(run.label for run in runs))
     if reference is None:
         # "abisim" itself, else "abisim,frozen" or "abisim=...".
@@ -149,7 +149,7 @@ def compare(
     )  # fmt: skip
 
 
-def _labelled_runs(folders: Sequence[str]) -> list[Run]:
+def _labeled_runs(folders: Sequence[str]) -> list[Run]:
     runs: list[Run] = []
     for word in folders:
         label, folder = split_label(word)
@@ -234,7 +234,7 @@ def _bounds(env_id: str, runs: list[Run], curves: list[Curve], notes: list[str])
         return traits.return_range
     low, high = min(float(c.returns.min()) for c in curves), max(float(c.returns.max()) for c in curves)
     high = high if high > low else low + 1.0
-    notes.append(f"{env_id}: normalised by the lowest and highest mean return of these runs ({low:.1f}, {high:.1f}).")
+    notes.append(f"{env_id}: normalized by the lowest and highest mean return of these runs ({low:.1f}, {high:.1f}).")
     return low, high
 
 
@@ -294,7 +294,7 @@ def _threshold_rows(
                 if threshold not in methods:
                     continue
                 level = methods[threshold].end()
-                if methods[threshold].normalised(level) < NEAR_THE_LOWEST:
+                if methods[threshold].normalized(level) < NEAR_THE_LOWEST:
                     notes.append(
                         f"{env_id}: {threshold} ends near the lowest return ({level:.4g}), which takes little to reach."
                     )
@@ -344,9 +344,9 @@ def _across(
     for label in labels:
         members = [groups[env_id][label] for env_id in shared]
         n = counts[label]
-        finals[label] = np.stack([group.normalised(group.last()[1])[:n] for group in members], axis=1)
+        finals[label] = np.stack([group.normalized(group.last()[1])[:n] for group in members], axis=1)
         areas[label] = np.stack(
-            [group.normalised(_areas(group, groups[group.env_id]))[:n] for group in members], axis=1
+            [group.normalized(_areas(group, groups[group.env_id]))[:n] for group in members], axis=1
         )
     aggregates = [
         {"score": name, "method": label, "iqm": value, "low": low, "high": high, "n_runs": counts[label]}

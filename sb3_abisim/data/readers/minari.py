@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sb3_abisim.common.spaces import is_channels_first, space_from_json, space_to_json
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import (
+    CONTENT_HASH_KEY,
     CUT,
     DRAWN_FORMAT_VERSION,
     FORMAT_VERSION,
@@ -223,7 +224,7 @@ def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[s
         "env_id": _recorded_env_id(metadata) or dataset_id,
         "env_kwargs": {},
         "factors": {},
-        "fingerprint": None,
+        CONTENT_HASH_KEY: None,
         "policy": "unknown",
         "seed": None,
         "n_envs": None,
@@ -237,7 +238,7 @@ def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[s
         ):
             raise ValueError(f"Minari dataset {dataset_id} was exported by another version of sb3_abisim")
         check_factor_layout(ours["factors"])
-        identity |= {key: ours[key] for key in ("env_id", "env_kwargs", "factors", "fingerprint", "policy", "seed")}
+        identity |= {key: ours[key] for key in ("env_id", "env_kwargs", "factors", CONTENT_HASH_KEY, "policy", "seed")}
         source["collected"] = {key: ours[key] for key in ("n_envs", "steps_per_shard")}
     return identity
 

@@ -30,13 +30,13 @@ class Clip:
     name: str
     group: str
     length: int
-    digest: str
+    hash: str
     load: Callable[[], NDArray[np.uint8]]
 
     @property
     def clip_id(self) -> int:
         """A number that names the content, whatever split or selection the clip is found in; 0 <= id < 2**60."""
-        return int(self.digest[:15], 16)
+        return int(self.hash[:15], 16)
 
 
 class Backgrounds:
@@ -65,9 +65,9 @@ class Backgrounds:
         return len(self.clips)
 
     @property
-    def fingerprint(self) -> str:
+    def content_hash(self) -> str:
         """sha256 over the clips in their order and the frame's shape; it changes when one pixel of a clip does."""
-        content = [list(FRAME_SHAPE), [[clip.name, clip.length, clip.digest] for clip in self.clips]]
+        content = [list(FRAME_SHAPE), [[clip.name, clip.length, clip.hash] for clip in self.clips]]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
     def select(self, names: Iterable[str]) -> "Backgrounds":
@@ -139,7 +139,7 @@ def split_groups(groups: Iterable[str], seed: int, eval_fraction: float) -> tupl
     return set(ranked[n_eval:]), set(ranked[:n_eval])
 
 
-def digest_of(frames: NDArray[np.uint8]) -> str:
+def array_hash(frames: NDArray[np.uint8]) -> str:
     """sha256 of an array's bytes, in hexadecimal.
 
     :param frames: of any shape and dtype

@@ -1,6 +1,6 @@
 """Other appearances of moving backgrounds.
 
-A few clips have a few colours, and an encoder that has seen no others takes a saturated background for an agent that
+A few clips have a few colors, and an encoder that has seen no others takes a saturated background for an agent that
 has moved (docs/figures.md). In training, each episode therefore shows its clip in a look of its own.
 """
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-class Looks:
+class ColorJitter:
     """A look for each environment: mirrored or not, the channels exchanged, each over another range.
 
     Integer arithmetic only: the same bytes on every machine.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.envs.backgrounds.clips import FRAME_SHAPE, SIZE, Backgrounds, Clip, digest_of
+from sb3_abisim.envs.backgrounds.clips import FRAME_SHAPE, SIZE, Backgrounds, Clip, array_hash
 
 MEDIA_FOLDER = Path(__file__).resolve().parents[2] / "media"
 # Camera paths are computed in this fraction of a photograph's pixel.
@@ -46,7 +46,7 @@ def _load_entry(entry: dict[str, Any]) -> NDArray[np.uint8]:
     axis = 0 if entry["kind"] == "shot" else 2
     pixels = np.cumsum(differences, axis=axis, dtype=np.uint8)
     frames = pixels if entry["kind"] == "shot" else render_pan(pixels, entry["path"], entry["length"])
-    if digest_of(frames) != entry["sha256"]:
+    if array_hash(frames) != entry["sha256"]:
         raise ValueError(f"clip {entry['name']!r} of {pack} is damaged (its sha256 differs); reinstall sb3_abisim")
     return frames
 

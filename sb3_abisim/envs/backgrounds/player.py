@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.envs.backgrounds.clips import Backgrounds
-from sb3_abisim.envs.backgrounds.color_jitter import Looks
+from sb3_abisim.envs.backgrounds.color_jitter import ColorJitter
 
 ORDERS = ("video", "shuffled")
 # Random numbers used per episode, whatever the clips are.
@@ -22,12 +22,12 @@ class BackgroundPlayer:
     :param backgrounds: the clips
     :param n_envs: number of environments
     :param order: "video", or "shuffled" for each clip's frames in a random order of the episode's own, which takes
-        away the correlation between neighbouring frames
-    :param recolour: whether each episode shows its clip in a look of its own (:class:`~sb3_abisim.envs.backgrounds.color_jitter.Looks`)
+        away the correlation between neighboring frames
+    :param color_jitter: whether each episode shows its clip in a look of its own (:class:`~sb3_abisim.envs.backgrounds.color_jitter.ColorJitter`)
     :raises ValueError: for an unknown order
     """
 
-    def __init__(self, backgrounds: Backgrounds, n_envs: int, order: str = "video", recolour: bool = False) -> None:
+    def __init__(self, backgrounds: Backgrounds, n_envs: int, order: str = "video", color_jitter: bool = False) -> None:
         if order not in ORDERS:
             raise ValueError(f"order must be one of {ORDERS}, got {order!r}")
         self.backgrounds = backgrounds
@@ -36,13 +36,13 @@ class BackgroundPlayer:
         self._shuffles: list[NDArray[np.int64]] | None = None
         if order == "shuffled":
             self._shuffles = [np.zeros(1, dtype=np.int64)] * n_envs
-        self._looks = Looks(n_envs) if recolour else None
+        self._color_jitter = ColorJitter(n_envs) if color_jitter else None
 
     @property
-    def fingerprint(self) -> str:
+    def content_hash(self) -> str:
         """That of the clips; another one where they are shown in other looks."""
-        plain = self.backgrounds.fingerprint
-        return plain if self._looks is None else hashlib.sha256(f"{plain} in looks".encode()).hexdigest()
+        plain = self.backgrounds.content_hash
+        return plain if self._color_jitter is None else hashlib.sha256(f"{plain} in looks".encode()).hexdigest()
 
     def start(self, index: int, generator: np.random.Generator) -> None:
         """Begin a new episode of environment ``index``.
@@ -58,8 +58,8 @@ class BackgroundPlayer:
         own = np.random.default_rng(int(own_draw * 2**53))
         if self._shuffles is not None:
             self._shuffles[index] = own.permutation(length)
-        if self._looks is not None:
-            self._looks.draw(index, own)
+        if self._color_jitter is not None:
+            self._color_jitter.draw(index, own)
 
     def advance(self) -> None:
         """Go on by one frame in every environment."""
@@ -82,7 +82,7 @@ class BackgroundPlayer:
         # Positions that are not shuffled need no folding here, `frames` does it.
         frame = self._position if self._shuffles is None else self.frame
         pictures = self.backgrounds.frames(self.clip[indices], frame[indices])
-        return pictures if self._looks is None else self._looks.apply(pictures, indices)
+        return pictures if self._color_jitter is None else self._color_jitter.apply(pictures, indices)
 
 
 def composite(

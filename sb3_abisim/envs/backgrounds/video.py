@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.common.files import file_digest, write_atomic
+from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
-from sb3_abisim.envs.backgrounds.clips import FRAME_SHAPE, SIZE, Backgrounds, Clip, digest_of
+from sb3_abisim.envs.backgrounds.clips import FRAME_SHAPE, SIZE, Backgrounds, Clip, array_hash
 from sb3_abisim.envs.backgrounds.video_files import Source
 
 if TYPE_CHECKING:
@@ -175,11 +175,11 @@ def _make_cache(folder: Path) -> None:
         raise type(error)(f"cannot keep decoded clips in {folder} ({error}); {remedy}") from error
 
 
-def _content_key(source: Source) -> str:
-    digest = hashlib.sha256(f"{_CACHE_VERSION}:{FRAME_SHAPE}:{source.is_video}".encode())
+def _content_hash(source: Source) -> str:
+    sha256 = hashlib.sha256(f"{_CACHE_VERSION}:{FRAME_SHAPE}:{source.is_video}".encode())
     for file in source.files:
-        digest.update(file_digest(file).encode())
-    return digest.hexdigest()
+        sha256.update(file_hash(file).encode())
+    return sha256.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class _Entry:
         try:
             note = json.loads(self.note_path.read_bytes())
             frames = _map(self.frames_path)
-            if len(frames) != note["n_frames"] or digest_of(frames) != note["sha256"]:
+            if len(frames) != note["n_frames"] or array_hash(frames) != note["sha256"]:
                 return None
         except (OSError, ValueError, KeyError, TypeError):
             return None
@@ -211,7 +211,7 @@ class _Entry:
 
     def decode(self, max_frames: int, total: int) -> None:
         """Decode the clip into the cache, up to ``max_frames`` of ``total`` for all clips."""
-        source, digest, count = self.source, hashlib.sha256(), 0
+        source, sha256, count = self.source, hashlib.sha256(), 0
 
         def write(file: BinaryIO) -> None:
             nonlocal count
@@ -220,7 +220,7 @@ class _Entry:
                 if count == max_frames:
                     raise _too_large(f"{source.path} and the clips before it", f"more than {total}", total)
                 block = shrink(image).tobytes()
-                digest.update(block)
+                sha256.update(block)
                 file.write(block)
                 count += 1
             file.seek(0)
@@ -228,7 +228,7 @@ class _Entry:
 
         _make_cache(cache_folder())
         write_atomic(self.frames_path, write)
-        note = {"n_frames": count, "sha256": digest.hexdigest(), "source": str(source.path)}
+        note = {"n_frames": count, "sha256": sha256.hexdigest(), "source": str(source.path)}
         write_atomic(self.note_path, lambda file: file.write(json.dumps(note).encode()))
 
     def expected_frames(self) -> int:
@@ -282,7 +282,7 @@ def load_split(
     :raises ClipError: for a clip that cannot be decoded, lacks frames or is shorter than ``min_frames``
     :raises ValueError: for a file on both sides, more than ``max_bytes`` of frames, or if every clip was skipped
     """
-    keys = {source: _content_key(source) for source in (*train, *unseen)}
+    keys = {source: _content_hash(source) for source in (*train, *unseen)}
     by_key = {keys[source]: source for source in train}
     for source in unseen:
         twin = by_key.get(keys[source])

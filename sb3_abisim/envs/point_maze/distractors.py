@@ -26,8 +26,8 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
     **Splits.** "train" and "eval" share no film and no photograph: pretrain and train on the one, evaluate on the
     other. "clean" shows the plain floor, for a comparison. The same seed gives the same mazes in all three.
 
-    **Looks.** In "train" each episode shows its clip in a look of its own, mirrored and in other colours
-    (:class:`~sb3_abisim.envs.backgrounds.color_jitter.Looks`), unless ``recolour`` is False; "eval" shows clips as they are.
+    **Looks.** In "train" each episode shows its clip in a look of its own, mirrored and in other colors
+    (:class:`~sb3_abisim.envs.backgrounds.color_jitter.ColorJitter`), unless ``color_jitter`` is False; "eval" shows clips as they are.
 
     **Factors.** Those of PointMaze, and ``clip``, the index of the clip in the split, ``clip_id``, a number that stands
     for its content in any split, and ``frame``, the index of the frame shown; int64, each -1 in the split "clean".
@@ -36,9 +36,9 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
     :param videos: folder of your own videos, see docs/distractors.md; None for the built-in clips ``photo_pan``
     :param split: "train", "eval" or "clean"
     :param order: "video", or "shuffled" for the frames of a clip in an order drawn for each episode, so that
-        neighbouring frames are not alike
+        neighboring frames are not alike
     :param clips: names of the clips to show; None for all of the split
-    :param recolour: whether "train" shows clips in looks drawn for each episode; of no effect in the other splits
+    :param color_jitter: whether "train" shows clips in looks drawn for each episode; of no effect in the other splits
     :param video_kwargs: further arguments of :func:`~sb3_abisim.envs.backgrounds.load.load_backgrounds`
     :param kwargs: arguments of PointMaze
     :raises ValueError: for unknown settings, and for what is wrong with the videos
@@ -52,7 +52,7 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
         split: str = "train",
         order: str = "video",
         clips: Sequence[str] | None = None,
-        recolour: bool = True,
+        color_jitter: bool = True,
         video_kwargs: dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
@@ -64,19 +64,19 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
             raise ValueError(
                 f"video_kwargs={video_kwargs} applies to your own videos only; give videos= or leave it out"
             )
-        check_flags(recolour=recolour)
+        check_flags(color_jitter=color_jitter)
         super().__init__(num_envs, **kwargs)
         self._player: BackgroundPlayer | None = None
         if split != "clean":
             backgrounds = load_backgrounds(videos, split, **(video_kwargs or {}))
             if clips is not None:
                 backgrounds = backgrounds.select(clips)
-            self._player = BackgroundPlayer(backgrounds, num_envs, order, recolour and split == "train")
+            self._player = BackgroundPlayer(backgrounds, num_envs, order, color_jitter and split == "train")
 
     @property
-    def fingerprint(self) -> str:
+    def content_hash(self) -> str:
         """sha256 over the clips that can be shown and whether in other looks, "clean" where there are none."""
-        return "clean" if self._player is None else self._player.fingerprint
+        return "clean" if self._player is None else self._player.content_hash
 
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         super()._reset_envs(indices)
@@ -121,7 +121,7 @@ class DistractorPointMazeEnv(SingleEnv):
     batch_class = DistractorPointMazeVectorEnv
 
     @property
-    def fingerprint(self) -> str:
+    def content_hash(self) -> str:
         """sha256 over the clips that can be shown, "clean" where there are none."""
-        fingerprint: str = self.batch.fingerprint  # type: ignore[attr-defined]
-        return fingerprint
+        content_hash: str = self.batch.content_hash  # type: ignore[attr-defined]
+        return content_hash

@@ -1,4 +1,4 @@
-"""PointMaze: a ball pushed through random obstacles to the centre of a room, seen from above as pixels."""
+"""PointMaze: a ball pushed through random obstacles to the center of a room, seen from above as pixels."""
 
 from typing import Any
 
@@ -15,11 +15,11 @@ from sb3_abisim.envs.point_maze.layout import (
     GOAL_RADIUS,
     N_OBSTACLES,
     OBSTACLE_PIXELS,
-    PIXELS_PER_METRE,
+    PIXELS_PER_METER,
     WALL_PIXELS,
     draw_layout,
     static_layer,
-    to_metres,
+    to_meters,
     to_pixels,
 )
 from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE
@@ -47,8 +47,8 @@ _N_WALLS = 4
 # What the next time step depends on; the solver begins from the last accelerations.
 _SIMULATION_STATE = ("qpos", "qvel", "qacc_warmstart")
 
-# The pixels (left, top, right, bottom) of a box in metres, the last two exclusive, with the room that a ball takes.
-_BOX_MARGINS = IMAGE_SIZE // 2 + PIXELS_PER_METRE * (BALL_RADIUS + _CLEARANCE) * np.array((-1, -1, 1, 1)) + (0, 0, 1, 1)
+# The pixels (left, top, right, bottom) of a box in meters, the last two exclusive, with the room that a ball takes.
+_BOX_MARGINS = IMAGE_SIZE // 2 + PIXELS_PER_METER * (BALL_RADIUS + _CLEARANCE) * np.array((-1, -1, 1, 1)) + (0, 0, 1, 1)
 # From them to the box's corners in a flattened table of counts; with the signs, what the box holds of those counted.
 _ROW = IMAGE_SIZE + 1
 _BOX_CORNERS = np.array([(1, 0, 1, 0), (_ROW, _ROW, 0, 0), (0, 1, 0, 1), (0, 0, _ROW, _ROW)])
@@ -82,7 +82,7 @@ _DISTANCES = TIMESTEP * np.cumsum(_SPEEDS)
 
 def point_model() -> mujoco.MjModel:
     """The room with its walls, obstacles (placed per simulation through ``geom_pos``) and the ball."""
-    half, thick, box = ROOM_SIZE / 2, WALL_PIXELS / PIXELS_PER_METRE / 2, OBSTACLE_PIXELS / PIXELS_PER_METRE / 2
+    half, thick, box = ROOM_SIZE / 2, WALL_PIXELS / PIXELS_PER_METER / 2, OBSTACLE_PIXELS / PIXELS_PER_METER / 2
     boxes = [(side * (half + thick), 0.0, thick, half) for side in (-1, 1)]
     boxes += [(0.0, side * (half + thick), half + 2 * thick, thick) for side in (-1, 1)]
     # Compiled away from the origin: MuJoCo takes a geom compiled at its body's frame to stay there (geom_sameframe).
@@ -110,11 +110,11 @@ class PointMazeVectorEnv(BatchEnv):
     """``num_envs`` point mazes, their physics advanced by one call.
 
     **World.** A room of 15 m x 15 m inside walls of 0.5 m; the picture shows 16 m x 16 m at exactly 4 pixels per
-    metre. Positions are (x, y) in metres from the centre of the room, x to the right and y *down* the picture. Each
+    meter. Positions are (x, y) in meters from the center of the room, x to the right and y *down* the picture. Each
     episode has 20 obstacles of 2 m x 2 m with corners on the pixel grid, uniform over the room outside the 2 m x 2 m
     square around the goal; they may overlap. The start is uniform over the positions that keep 0.125 m between the
-    ball's centre and everything solid and lie outside the goal. Obstacles and start are drawn again until a corridor
-    0.5 m wide leads from the start to the goal, which is the centre (0, 0).
+    ball's center and everything solid and lie outside the goal. Obstacles and start are drawn again until a corridor
+    0.5 m wide leads from the start to the goal, which is the center (0, 0).
 
     **Actions.** 0, 1, 2, 3 push with full force up, down, left, right; with ``continuous`` a force (x, y) in
     ``Box(-1, 1, (2,), float32)``, x to the right and y down, in units of 100 N per axis.
@@ -129,11 +129,11 @@ class PointMazeVectorEnv(BatchEnv):
     and the agent as a red disc of 0.3 m radius, antialiased, so that its position can be read to a fraction of a
     pixel.
 
-    **Reward.** -1 per step and 0 on the step that ends with the ball's centre within 1 m of the goal, which ends
+    **Reward.** -1 per step and 0 on the step that ends with the ball's center within 1 m of the goal, which ends
     the episode; with ``reward_type="sparse"`` 0 and 1. 128 steps under the registered ids.
 
-    **Factors.** ``agent`` (2,), ``velocity`` (2,) with momentum only, ``obstacles`` (20, 2) centres, ``goal`` (2,),
-    all float32, in metres and m/s.
+    **Factors.** ``agent`` (2,), ``velocity`` (2,) with momentum only, ``obstacles`` (20, 2) centers, ``goal`` (2,),
+    all float32, in meters and m/s.
 
     :param num_envs: number of copies, at least 1
     :param continuous: two-dimensional forces instead of four pushes
@@ -177,7 +177,7 @@ class PointMazeVectorEnv(BatchEnv):
         # 255 where floor is seen, and the layer elsewhere: to lay the layer over other pictures by bitwise operations.
         self._floor = np.zeros((num_envs, 1, IMAGE_SIZE, IMAGE_SIZE), dtype=np.uint8)
         self._standing = np.zeros_like(self._layers)
-        self._agent = top_down.DiscPainter(AGENT_RADIUS * PIXELS_PER_METRE, IMAGE_SIZE)
+        self._agent = top_down.DiscPainter(AGENT_RADIUS * PIXELS_PER_METER, IMAGE_SIZE)
         # [row, column]: how many pixels above and to the left are walls or obstacles.
         self._solid_counts = np.zeros((num_envs, IMAGE_SIZE + 1, IMAGE_SIZE + 1), dtype=np.int64)
         self._first_count = self._everyone[:, None] * (IMAGE_SIZE + 1) ** 2
@@ -211,7 +211,7 @@ class PointMazeVectorEnv(BatchEnv):
         self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i in indices:
             corners, solid, start = draw_layout(self._generators[i])
-            self._obstacle_pos[i] = to_metres(corners + OBSTACLE_PIXELS / 2)
+            self._obstacle_pos[i] = to_meters(corners + OBSTACLE_PIXELS / 2)
             self._position[i] = start
             self._solid_counts[i, 1:, 1:] = solid.cumsum(axis=0).cumsum(axis=1)
             self._layers[i] = static_layer(solid)
@@ -261,7 +261,7 @@ class PointMazeVectorEnv(BatchEnv):
         box = np.empty((self.num_envs, 4))
         np.minimum(starts, ends, out=box[:, :2])
         np.maximum(starts, ends, out=box[:, 2:])
-        pixels = (box * PIXELS_PER_METRE + _BOX_MARGINS).astype(np.int64)
+        pixels = (box * PIXELS_PER_METER + _BOX_MARGINS).astype(np.int64)
         np.maximum(pixels, 0, out=pixels)
         np.minimum(pixels, IMAGE_SIZE, out=pixels)
         counts = self._solid_counts.reshape(-1)[pixels @ _BOX_CORNERS + self._first_count]

@@ -8,30 +8,30 @@ from numpy.typing import NDArray
 from sb3_abisim.envs.point_maze import top_down
 from sb3_abisim.envs.point_maze.top_down import IMAGE_SIZE
 
-PIXELS_PER_METRE = 4
+PIXELS_PER_METER = 4
 WALL_PIXELS = 2
 N_OBSTACLES = 20
 OBSTACLE_PIXELS = 8
 GOAL_RADIUS = 1.0  # m
 GOAL_MARK_PIXELS = 4
 
-_CENTRE = IMAGE_SIZE // 2
+_CENTER = IMAGE_SIZE // 2
 
 
 def to_pixels(positions: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Positions (x, y) in metres, shape (..., 2), as (column, row) in pixels.
+    """Positions (x, y) in meters, shape (..., 2), as (column, row) in pixels.
 
-    :param positions: in metres from the middle of the picture, y down
+    :param positions: in meters from the middle of the picture, y down
     """
-    return positions * np.float64(PIXELS_PER_METRE) + _CENTRE
+    return positions * np.float64(PIXELS_PER_METER) + _CENTER
 
 
-def to_metres(pixels: NDArray[Any]) -> NDArray[np.float64]:
-    """(column, row) in pixels, shape (..., 2), as positions (x, y) in metres.
+def to_meters(pixels: NDArray[Any]) -> NDArray[np.float64]:
+    """(column, row) in pixels, shape (..., 2), as positions (x, y) in meters.
 
     :param pixels: real numbers, shape (..., 2)
     """
-    return (pixels - _CENTRE) / PIXELS_PER_METRE
+    return (pixels - _CENTER) / PIXELS_PER_METER
 
 
 # The layout of an episode, computed on bitboards: bit 64 * row + column of a Python int is a pixel.
@@ -53,15 +53,15 @@ def _unpack(board: int) -> NDArray[np.bool_]:
 def _corner_choices() -> NDArray[np.int64]:
     """Every allowed (column, row) of an obstacle's top left pixel."""
     corners = np.arange(WALL_PIXELS, IMAGE_SIZE - WALL_PIXELS - OBSTACLE_PIXELS + 1)
-    reach = int(GOAL_RADIUS * PIXELS_PER_METRE)
-    at_goal = (corners > _CENTRE - reach - OBSTACLE_PIXELS) & (corners < _CENTRE + reach)
+    reach = int(GOAL_RADIUS * PIXELS_PER_METER)
+    at_goal = (corners > _CENTER - reach - OBSTACLE_PIXELS) & (corners < _CENTER + reach)
     return corners[np.argwhere(~(at_goal[:, None] & at_goal))]
 
 
 def _start_blocks() -> int:
-    """The 2 x 2 blocks around whose centre no position within half a pixel per axis is at the goal."""
-    offset = np.maximum(np.abs(np.arange(IMAGE_SIZE) + 1 - _CENTRE) - 0.5, 0.0)
-    outside = np.hypot(offset[:, None], offset) > GOAL_RADIUS * PIXELS_PER_METRE
+    """The 2 x 2 blocks around whose center no position within half a pixel per axis is at the goal."""
+    offset = np.maximum(np.abs(np.arange(IMAGE_SIZE) + 1 - _CENTER) - 0.5, 0.0)
+    outside = np.hypot(offset[:, None], offset) > GOAL_RADIUS * PIXELS_PER_METER
     return int.from_bytes(np.packbits(outside, bitorder="little").tobytes(), "little")
 
 
@@ -69,12 +69,12 @@ _OBSTACLE = _square(0, 0, OBSTACLE_PIXELS)
 _FULL = (1 << IMAGE_SIZE**2) - 1
 _WALLS = _FULL & ~_square(WALL_PIXELS, WALL_PIXELS, IMAGE_SIZE - 2 * WALL_PIXELS)
 # A corridor is made of 2 x 2 pixels of free floor, named by their top left one; this one is the goal's.
-_GOAL_BLOCK = _square(_CENTRE - 1, _CENTRE - 1, 1)
+_GOAL_BLOCK = _square(_CENTER - 1, _CENTER - 1, 1)
 _CORNERS = _corner_choices()
 _START_BLOCKS = _start_blocks()
 
 WALL_MASK = _unpack(_WALLS)
-GOAL_MASK = _unpack(_square(_CENTRE - GOAL_MARK_PIXELS // 2, _CENTRE - GOAL_MARK_PIXELS // 2, GOAL_MARK_PIXELS))
+GOAL_MASK = _unpack(_square(_CENTER - GOAL_MARK_PIXELS // 2, _CENTER - GOAL_MARK_PIXELS // 2, GOAL_MARK_PIXELS))
 _EMPTY_LAYER = top_down.floor(IMAGE_SIZE)
 top_down.paint(_EMPTY_LAYER, WALL_MASK, top_down.WALL)
 top_down.paint(_EMPTY_LAYER, GOAL_MASK, top_down.GOAL)
@@ -96,7 +96,7 @@ def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], NDAr
 
     :param generator: the environment's own
     :return: (column, row) of the obstacles' top left pixels, shape (20, 2); where obstacles and walls are, bool
-        (64, 64); the start (x, y) in metres
+        (64, 64); the start (x, y) in meters
     """
     while True:
         corners = _CORNERS[generator.integers(len(_CORNERS), size=N_OBSTACLES)]
@@ -112,7 +112,7 @@ def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], NDAr
         jitter = generator.uniform(-0.5, 0.5, size=2)
         if _connected(blocks, 1 << block, _GOAL_BLOCK):
             row, column = divmod(block, _STRIDE)
-            return corners, _unpack(occupied), to_metres(np.array([column + 1, row + 1]) + jitter)
+            return corners, _unpack(occupied), to_meters(np.array([column + 1, row + 1]) + jitter)
 
 
 def static_layer(solid: NDArray[np.bool_]) -> NDArray[np.uint8]:

@@ -23,7 +23,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         env = PointMazePixels(gym.make("PointMaze_UMaze-v3", continuing_task=False, max_episode_steps=3000),
                               continuous=False, frame_skip=30, momentum=False)
 
-    **Observation.** uint8 (3, 64, 64), RGB, in the colours of ``PointMaze-v0``, drawn without GL: walls where the map
+    **Observation.** uint8 (3, 64, 64), RGB, in the colors of ``PointMaze-v0``, drawn without GL: walls where the map
     has 1, the floor within 0.45 m (its success radius) of the wrapped environment's own goal in green, the
     agent as a red disc of 0.3 m radius. A cell of the map takes the whole number of pixels that fits the map into the
     picture; what lies around the map is drawn as wall. With ``backgrounds`` the floor shows moving pictures.
@@ -48,7 +48,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
     :param backgrounds: clips to show on the floor, from
         :func:`~sb3_abisim.envs.backgrounds.load.load_backgrounds`; None for plain floor
     :param order: "video" or "shuffled", of the frames of a clip
-    :param recolour: whether each episode shows its clip in a look of its own, as the Distractor environments train
+    :param color_jitter: whether each episode shows its clip in a look of its own, as the Distractor environments train
     :raises ValueError: for another kind of environment, a map of more than 21 cells a side, or ``frame_skip`` below 1
     """
 
@@ -62,14 +62,14 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         momentum: bool = True,
         backgrounds: Backgrounds | None = None,
         order: str = "video",
-        recolour: bool = False,
+        color_jitter: bool = False,
     ) -> None:
         self.env = env
         self.render_mode = "rgb_array"
         self._maze_env: Any = env.unwrapped
         if not hasattr(self._maze_env, "point_env") or not hasattr(self._maze_env, "maze"):
             raise ValueError(f"PointMazePixels wraps the PointMaze ids of gymnasium-robotics, got {env}")
-        check_flags(continuous=continuous, momentum=momentum, recolour=recolour)
+        check_flags(continuous=continuous, momentum=momentum, color_jitter=color_jitter)
         if frame_skip < 1:
             raise ValueError(f"frame_skip must be at least 1, got {frame_skip}")
         self.continuous = continuous
@@ -81,9 +81,9 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         else:
             self.action_space = gym.spaces.Discrete(len(DIRECTIONS))
         self._walls = self._draw_walls()
-        self._goal = DiscPainter(GOAL_RADIUS * self._pixels_per_metre, IMAGE_SIZE, top_down.GOAL)
-        self._agent = DiscPainter(AGENT_RADIUS * self._pixels_per_metre, IMAGE_SIZE)
-        self._player = None if backgrounds is None else BackgroundPlayer(backgrounds, 1, order, recolour)
+        self._goal = DiscPainter(GOAL_RADIUS * self._pixels_per_meter, IMAGE_SIZE, top_down.GOAL)
+        self._agent = DiscPainter(AGENT_RADIUS * self._pixels_per_meter, IMAGE_SIZE)
+        self._player = None if backgrounds is None else BackgroundPlayer(backgrounds, 1, order, color_jitter)
 
     def _draw_walls(self) -> NDArray[np.bool_]:
         """The map fitted into the picture; sets the scale."""
@@ -95,17 +95,17 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
                 f"a map of {walls.shape[0]} x {walls.shape[1]} cells does not fit a picture of {IMAGE_SIZE} pixels; "
                 f"use one of at most {IMAGE_SIZE // MIN_CELL_PIXELS} cells a side"
             )
-        self._pixels_per_metre = cell / maze.maze_size_scaling
+        self._pixels_per_meter = cell / maze.maze_size_scaling
         picture = np.ones((IMAGE_SIZE, IMAGE_SIZE), dtype=bool)
         height, width = (cell * n for n in walls.shape)
         top, left = (IMAGE_SIZE - height) // 2, (IMAGE_SIZE - width) // 2
         picture[top : top + height, left : left + width] = walls.repeat(cell, axis=0).repeat(cell, axis=1)
-        self._centre = np.array([left + width / 2, top + height / 2])
+        self._center = np.array([left + width / 2, top + height / 2])
         return picture
 
     def _to_pixels(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """The wrapped environment's (x, y), y up, as one (column, row): shape (1, 2)."""
-        pixels: NDArray[np.float64] = self._centre + position * (1.0, -1.0) * self._pixels_per_metre
+        pixels: NDArray[np.float64] = self._center + position * (1.0, -1.0) * self._pixels_per_meter
         return pixels[None]
 
     @property
@@ -185,7 +185,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         self.env.close()
 
     def factors(self) -> dict[str, NDArray[np.float32]]:
-        """``agent``, ``velocity`` and ``goal``, each (2,) float32, in metres and m/s from the middle of the map, x to
+        """``agent``, ``velocity`` and ``goal``, each (2,) float32, in meters and m/s from the middle of the map, x to
         the right and y down."""
         data, flip = self._maze_env.data, np.array([1, -1])
         values = {"agent": data.qpos[:2], "velocity": data.qvel[:2], "goal": self._maze_env.goal}

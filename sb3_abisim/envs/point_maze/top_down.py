@@ -1,4 +1,4 @@
-"""A small rasteriser for mazes seen from straight above, without GL.
+"""A small rasterizer for mazes seen from straight above, without GL.
 
 A picture is the static layer of an episode (floor, walls, obstacles, goal; every edge lies on the pixel grid) plus the
 agent, a disc whose pixels are mixed in proportion to the area it covers of them. The mixing is integer arithmetic on
@@ -24,23 +24,23 @@ OBSTACLE = (38, 44, 64)
 GOAL = (40, 170, 70)
 AGENT = (220, 40, 40)
 
-# Positions within a pixel are told apart to 1/128 of it: at most two grey levels between neighbouring ones.
+# Positions within a pixel are told apart to 1/128 of it: at most two gray levels between neighboring ones.
 _SUBPIXEL_BITS = 7
 SUBPIXELS = 1 << _SUBPIXEL_BITS
 _PART_WEIGHTS = np.array((1, SUBPIXELS))
 
 
-def disc_coverage(centre: NDArray[np.float64], radius: float, size: int) -> NDArray[np.float64]:
+def disc_coverage(center: NDArray[np.float64], radius: float, size: int) -> NDArray[np.float64]:
     """The exact share of each pixel that a disc covers.
 
-    :param centre: (column, row) of the disc's centre in pixels, shape (..., 2)
+    :param center: (column, row) of the disc's center in pixels, shape (..., 2)
     :param radius: in pixels, above 0
     :param size: the coverage is computed for the pixels of rows and columns 0 to ``size`` - 1
     :return: shape (..., size, size), indexed [row, column], 0..1
     """
     edges = np.arange(size + 1, dtype=np.float64)
-    x = np.clip(edges - centre[..., 0, None], -radius, radius)[..., None, :]
-    y = np.clip(edges - centre[..., 1, None], -radius, radius)[..., :, None]
+    x = np.clip(edges - center[..., 0, None], -radius, radius)[..., None, :]
+    y = np.clip(edges - center[..., 1, None], -radius, radius)[..., :, None]
     full = np.pi * radius**2
     left, above = _area_below(x, radius), _area_below(y, radius)
     # Area of the part of the disc with abscissa up to x and ordinate up to y.
@@ -51,7 +51,7 @@ def disc_coverage(centre: NDArray[np.float64], radius: float, size: int) -> NDAr
 
 
 def _area_below(x: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
-    """Area of the part of a centred disc with abscissa up to ``x``, for x within the radius."""
+    """Area of the part of a centered disc with abscissa up to ``x``, for x within the radius."""
     area: NDArray[np.float64] = x * np.sqrt(radius**2 - x**2) + radius**2 * (np.arcsin(x / radius) + np.pi / 2)
     return area
 
@@ -80,10 +80,10 @@ class DiscPainter:
 
     :param radius: in pixels
     :param size: height and width of the pictures, in pixels
-    :param colour: RGB, 0..255
+    :param color: RGB, 0..255
     """
 
-    def __init__(self, radius: float, size: int, colour: tuple[int, int, int] = AGENT) -> None:
+    def __init__(self, radius: float, size: int, color: tuple[int, int, int] = AGENT) -> None:
         self.radius = radius
         self.size = size
         self._alphas = _alpha_table(radius)
@@ -92,43 +92,43 @@ class DiscPainter:
         self._weights = np.array((1, size))
         self._steps = (np.arange(patch)[:, None] * size + np.arange(patch)).reshape(-1)
         self._channels = np.arange(3)[:, None] * size**2 + self._steps
-        self._colour = np.array(colour, dtype=np.uint32)[:, None]
+        self._color = np.array(color, dtype=np.uint32)[:, None]
 
-    def _locate(self, centres: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    def _locate(self, centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Flat index of each patch's first pixel, and its coverage, shapes (n,) and (n, patch * patch)."""
-        fine = np.floor((centres - self.radius) * SUBPIXELS).astype(np.int64)
+        fine = np.floor((centers - self.radius) * SUBPIXELS).astype(np.int64)
         # Negative numbers are the largest unsigned ones.
         if fine.view(np.uint64).max() >= self._limit:
-            raise ValueError(f"a disc of {self.radius} pixels leaves the {self.size} x {self.size} picture: {centres}")
+            raise ValueError(f"a disc of {self.radius} pixels leaves the {self.size} x {self.size} picture: {centers}")
         whole, part = fine >> _SUBPIXEL_BITS, fine & (SUBPIXELS - 1)
         return whole @ self._weights, self._alphas[part @ _PART_WEIGHTS]
 
     def draw(
-        self, pictures: NDArray[np.uint8], centres: NDArray[np.float64], over: NDArray[np.uint8] | None = None
+        self, pictures: NDArray[np.uint8], centers: NDArray[np.float64], over: NDArray[np.uint8] | None = None
     ) -> None:
         """Draw the discs in place.
 
         :param pictures: contiguous, shape (n, 3, size, size)
-        :param centres: (column, row) in pixels, shape (n, 2)
+        :param centers: (column, row) in pixels, shape (n, 2)
         :param over: what the discs' edges mix with, contiguous and shaped like ``pictures``; None for ``pictures``
         :raises ValueError: where a disc, or the pixel beside it, would lie outside the picture
         """
-        first, alphas = self._locate(centres)
+        first, alphas = self._locate(centers)
         flat = pictures.reshape(-1)
         starts = first + np.arange(len(pictures)) * (3 * self.size**2)
         where = starts[:, None, None] + self._channels
         alpha = alphas[:, None, :].astype(np.uint32)
         below = flat[where] if over is None else over.reshape(-1)[where]
-        mixed = (below * (255 - alpha) + self._colour * alpha + 127) // 255
+        mixed = (below * (255 - alpha) + self._color * alpha + 127) // 255
         flat[where] = mixed if over is None else np.where(alpha > 0, mixed, flat[where])
 
-    def mark(self, masks: NDArray[np.bool_], centres: NDArray[np.float64]) -> None:
+    def mark(self, masks: NDArray[np.bool_], centers: NDArray[np.float64]) -> None:
         """Set the pixels that the discs touch, in place.
 
         :param masks: contiguous, shape (n, size, size)
-        :param centres: (column, row) in pixels, shape (n, 2)
+        :param centers: (column, row) in pixels, shape (n, 2)
         """
-        first, alphas = self._locate(centres)
+        first, alphas = self._locate(centers)
         flat = masks.reshape(-1)
         where = (first + np.arange(len(masks)) * self.size**2)[:, None] + self._steps
         flat[where] |= alphas > 0
@@ -142,31 +142,31 @@ def floor(size: int) -> NDArray[np.uint8]:
     return np.tile(np.array(FLOOR, dtype=np.uint8)[:, None, None], (1, size, size))
 
 
-def paint(picture: NDArray[np.uint8], where: NDArray[np.bool_], colour: tuple[int, int, int]) -> None:
-    """Fill the pixels ``where`` (height, width) of one picture (3, height, width) with a colour, in place.
+def paint(picture: NDArray[np.uint8], where: NDArray[np.bool_], color: tuple[int, int, int]) -> None:
+    """Fill the pixels ``where`` (height, width) of one picture (3, height, width) with a color, in place.
 
     :param picture: uint8, contiguous or not
     :param where: bool
-    :param colour: RGB, 0..255
+    :param color: RGB, 0..255
     """
-    for channel, value in zip(picture, colour, strict=True):
+    for channel, value in zip(picture, color, strict=True):
         channel[where] = value
 
 
 def enlarge(
     backdrop: NDArray[np.uint8],
-    centre: NDArray[np.float64],
+    center: NDArray[np.float64],
     radius: float,
     scale: int = 8,
 ) -> NDArray[np.uint8]:
     """A picture for people: the backdrop with sharp, larger pixels and the disc drawn at the larger scale.
 
     :param backdrop: the picture without the agent, shape (3, size, size)
-    :param centre: (column, row) of the disc in pixels of the backdrop
+    :param center: (column, row) of the disc in pixels of the backdrop
     :param radius: in pixels of the backdrop
     :param scale: how many pixels each pixel becomes per side
     :return: shape (size * scale, size * scale, 3), RGB
     """
     large = backdrop.repeat(scale, axis=1).repeat(scale, axis=2).transpose(1, 2, 0)
-    alpha = disc_coverage(np.asarray(centre) * scale, radius * scale, len(large))[..., None]
+    alpha = disc_coverage(np.asarray(center) * scale, radius * scale, len(large))[..., None]
     return np.rint(large * (1 - alpha) + np.array(AGENT) * alpha).astype(np.uint8)

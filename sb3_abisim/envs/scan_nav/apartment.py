@@ -26,7 +26,7 @@ DOOR_WIDTH, DOOR_HEIGHT = 0.9, 2.05  # m
 _GAP = 0.01  # m
 _FLOOR_PIXELS = 50  # per m
 _ROUND = 20  # sides of a cylinder
-# Lengths here are whole centimetres, and edges exactly on the centres of a map's pixels would be left to rounding.
+# Lengths here are whole centimeters, and edges exactly on the centers of a map's pixels would be left to rounding.
 _OFFSET = (0.0037, 0.0043)  # m
 
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1
@@ -117,7 +117,7 @@ def apartment_mesh(seed: int) -> ScanMesh:
     solid = [polygon for polygons in builder.polygons.values() for polygon in polygons]
     builder.quad([(0, 0, 0), (width, 0, 0), (width, depth, 0), (0, depth, 0)], "floor")
     textures = {
-        name: texture(kind, colours[rng.integers(len(colours))], rng) for name, (kind, colours) in TEXTURES.items()
+        name: texture(kind, colors[rng.integers(len(colors))], rng) for name, (kind, colors) in TEXTURES.items()
     }
     textures["floor"] = _floor_texture(rng, rooms, walls, rugs, solid, (width, depth))
     mesh = builder.mesh(textures, (width, depth))
@@ -325,7 +325,7 @@ def _pixels(box: Box, shape: tuple[int, int], margin: float = 0.0) -> tuple[slic
     return slice(max(y0, 0), min(max(y1, y0 + 1), shape[0])), slice(max(x0, 0), min(max(x1, x0 + 1), shape[1]))
 
 
-def _planks(rng: np.random.Generator, shape: tuple[int, int], colour: tuple[int, int, int]) -> NDArray[np.float64]:
+def _planks(rng: np.random.Generator, shape: tuple[int, int], color: tuple[int, int, int]) -> NDArray[np.float64]:
     """Boards 16 cm wide and 1.2 m long, each row shifted."""
     board = round(0.16 * _FLOOR_PIXELS)
     long = round(1.2 * _FLOOR_PIXELS)
@@ -336,16 +336,16 @@ def _planks(rng: np.random.Generator, shape: tuple[int, int], colour: tuple[int,
     grain = ndimage.gaussian_filter(rng.standard_normal(shape), (0.6, 6))
     light = tone + grain / grain.std() * 6
     light = light - 20.0 * ((y % board == 0) | ((x + (row * 47) % long) % long == 0))
-    return np.asarray(np.array(colour) + light[..., None])
+    return np.asarray(np.array(color) + light[..., None])
 
 
 def _tiles(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Square tiles of 30 cm, of one colour or two."""
+    """Square tiles of 30 cm, of one color or two."""
     side = round(0.3 * _FLOOR_PIXELS)
     y, x = np.mgrid[: shape[0], : shape[1]]
     pairs = [((206, 206, 200), (206, 206, 200)), ((220, 220, 216), (120, 132, 140)), ((196, 176, 150), (184, 160, 132))]
-    colours = np.array(pairs[rng.integers(len(pairs))], dtype=np.float64)
-    picture = colours[(y // side + x // side) % 2]
+    colors = np.array(pairs[rng.integers(len(pairs))], dtype=np.float64)
+    picture = colors[(y // side + x // side) % 2]
     tone = rng.normal(0, 5, (shape[0] // side + 1, shape[1] // side + 1))[y // side, x // side]
     joint = (y % side == 0) | (x % side == 0)
     tiled: NDArray[np.float64] = np.where(joint[..., None], 150.0, picture + tone[..., None])
@@ -354,8 +354,8 @@ def _tiles(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float
 
 def _rug(rng: np.random.Generator, shape: tuple[int, int], kind: str) -> NDArray[np.float64]:
     """A border and a pattern of lozenges or stripes."""
-    colours = np.array([(150, 52, 48), (52, 76, 110), (176, 168, 150), (92, 110, 92), (120, 84, 120)], dtype=np.float64)
-    ground, figure = colours[rng.permutation(len(colours))[:2]]
+    colors = np.array([(150, 52, 48), (52, 76, 110), (176, 168, 150), (92, 110, 92), (120, 84, 120)], dtype=np.float64)
+    ground, figure = colors[rng.permutation(len(colors))[:2]]
     y, x = np.mgrid[: shape[0], : shape[1]]
     pattern = (abs(y % 20 - 10) + abs(x % 20 - 10)) < 6 if rng.random() < 0.6 else (x // 6) % 2 == 0
     picture = np.where(pattern[..., None], figure, ground)

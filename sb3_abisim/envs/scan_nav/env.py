@@ -30,7 +30,7 @@ class ScanNavVectorEnv(BatchEnv):
     as a yellow marker with a magenta nose. ``obs_mode="rgbd"``: ``Box(0, 255, (4, image_size, image_size), uint8)``,
     red, green, blue, and depth as 255 (3 m - z) / 3 m for a surface z above the floor; where there is no surface all
     are 0. ``"rgb"``: the first three. ``"dict"``: Habitat's form, ``rgb`` uint8 (image_size, image_size, 3) and
-    ``depth`` float32 (image_size, image_size, 1) in 0..1, metres below the camera (at 3 m) divided by 10. The depth
+    ``depth`` float32 (image_size, image_size, 1) in 0..1, meters below the camera (at 3 m) divided by 10. The depth
     has no marker.
 
     **Action.** ``Discrete(4)``: stop, move forward 0.25 m, turn left 10 degrees, turn right 10 degrees.
@@ -58,7 +58,7 @@ class ScanNavVectorEnv(BatchEnv):
     :param scenes: a scan file, a map's ``.npz`` file, a :class:`ScanMap`, the seed of a flat, or a list of these; None
         for the five flats
     :param image_size: pixels per side, even, at least 32
-    :param view_size: metres per side
+    :param view_size: meters per side
     :param obs_mode: "rgbd", "dict" or "rgb"
     :param marker: "arrow", whose nose shows the heading, or "box", the paper's plain square
     :param stop: "action" or "auto"
@@ -148,9 +148,9 @@ class ScanNavVectorEnv(BatchEnv):
         self._success, self._collided = np.zeros((2, num_envs), dtype=bool)
 
     @property
-    def fingerprint(self) -> str:
+    def content_hash(self) -> str:
         """sha256 over the maps and the agent's marker."""
-        parts = [scan.fingerprint for scan in self.scans] + [repr(MARKERS[self.marker])]
+        parts = [scan.content_hash for scan in self.scans] + [repr(MARKERS[self.marker])]
         return hashlib.sha256("".join(parts).encode()).hexdigest()
 
     # Episodes.
@@ -166,7 +166,7 @@ class ScanNavVectorEnv(BatchEnv):
             raise ValueError(f"the option scene must be an index of {len(self.scans)} scenes, got {scene!r}")
         for name in ("goal", "start"):
             if name in options and (np.shape(options[name]) != (2,) or not np.isfinite(options[name]).all()):
-                raise ValueError(f"the option {name} must be (x, y) in metres, got {options[name]!r}")
+                raise ValueError(f"the option {name} must be (x, y) in meters, got {options[name]!r}")
         if not np.isfinite(options.get("heading", 0.0)):
             raise ValueError(f"the option heading must be a number of degrees, got {options['heading']!r}")
         # A goal without a scene is in the first one.
@@ -309,8 +309,8 @@ class ScanNavVectorEnv(BatchEnv):
         views = list(zip(scenes.tolist(), corners.tolist(), strict=True))
         for frame, (scene, (row, column)) in zip(frames, views, strict=True):
             frame[:] = self._views[scene].rgbd[: len(frame), row : row + n, column : column + n]
-        centres = n / 2 + offsets * (1 / self._pitch, -1 / self._pitch)
-        self._painter.draw(frames, centres, headings)
+        centers = n / 2 + offsets * (1 / self._pitch, -1 / self._pitch)
+        self._painter.draw(frames, centers, headings)
         if self.obs_mode != "dict":
             return frames
         depth = [self._views[scene].depth[row : row + n, column : column + n] for scene, (row, column) in views]
@@ -340,10 +340,10 @@ class ScanNavEnv(SingleEnv):
     batch_class = ScanNavVectorEnv
 
     @property
-    def fingerprint(self) -> str:
+    def content_hash(self) -> str:
         """sha256 over the maps and the agent's marker."""
         # Behind BatchedVecEnv the batch is one row of another, which passes this on.
-        return str(self.batch.fingerprint)  # type: ignore[attr-defined]
+        return str(self.batch.content_hash)  # type: ignore[attr-defined]
 
     def oracle_action(self) -> int:
         """See :meth:`ScanNavVectorEnv.oracle_actions`."""

@@ -13,7 +13,7 @@ _UNSUPPORTED = {
     "KHR_draco_mesh_compression": "Draco compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
     "EXT_meshopt_compression": "meshopt compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
     "KHR_texture_basisu": "KTX2 textures (convert them: `npx @gltf-transform/cli ktxdecompress IN OUT`)",
-    "KHR_mesh_quantization": "quantised vertices (undo it: `npx @gltf-transform/cli dequantize IN OUT`)",
+    "KHR_mesh_quantization": "quantized vertices (undo it: `npx @gltf-transform/cli dequantize IN OUT`)",
 }
 # Extensions that a file may require and that change nothing seen from above, or that trimesh knows.
 _HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
@@ -82,13 +82,13 @@ def _check_extensions(path: Path, header: dict[str, Any]) -> None:
         chosen = moved.get("texCoord", texture.get("texCoord", 0))
         if chosen or any(moved.get(k, v) != v for k, v in _UNMOVED.items()):
             raise SceneError(
-                f"{path} has a colour texture in a second set of coordinates, or moved or repeated by "
+                f"{path} has a color texture in a second set of coordinates, or moved or repeated by "
                 "KHR_texture_transform, which is not supported; bake the texture (in Blender) and export it again"
             )
 
 
 def primitives(header: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """A glTF file's runs of triangles, each with its material's reference to a colour texture, or {}.
+    """A glTF file's runs of triangles, each with its material's reference to a color texture, or {}.
 
     :param header: its JSON part
     """
@@ -96,12 +96,12 @@ def primitives(header: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, A
     for primitive in (p for mesh in header.get("meshes", []) for p in mesh["primitives"]):
         if primitive.get("mode", 4) in _TRIANGLES:
             material = header["materials"][primitive["material"]] if "material" in primitive else {}
-            found.append((primitive, _colour_texture(material)))
+            found.append((primitive, _color_texture(material)))
     return found
 
 
-def _colour_texture(material: dict[str, Any]) -> dict[str, Any]:
-    """A glTF material's reference to a colour texture, or {}."""
+def _color_texture(material: dict[str, Any]) -> dict[str, Any]:
+    """A glTF material's reference to a color texture, or {}."""
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
     metallic = material.get("pbrMetallicRoughness", {})
     reference: dict[str, Any] = glossy.get("diffuseTexture") or metallic.get("baseColorTexture") or {}
@@ -135,7 +135,7 @@ def lost_materials(kind: str, header: Any, libraries: list[bytes], missing: list
     """
     if not missing or kind == "ply" or any(name.lower().endswith(".mtl") for name in missing):
         return lambda material: bool(missing)
-    names = {m.get("name") for m in header.get("materials", []) if texture_uri(header, _colour_texture(m)) in missing}
+    names = {m.get("name") for m in header.get("materials", []) if texture_uri(header, _color_texture(m)) in missing}
     for line in b"\n".join(libraries).decode(errors="replace").splitlines():
         key, _, value = line.strip().partition(" ")
         if key.lower() == "newmtl":

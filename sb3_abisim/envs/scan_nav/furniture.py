@@ -1,6 +1,6 @@
 """Furniture and textures for :mod:`~sb3_abisim.envs.scan_nav.apartment`.
 
-A piece is a list of solids in its own frame: u along the wall that it stands at, v away from the wall, z up, in metres.
+A piece is a list of solids in its own frame: u along the wall that it stands at, v away from the wall, z up, in meters.
 ``(u0, v0, u1, v1, z0, z1, texture)`` is a box; ``(u, v, radius, z0, z1, texture)`` an upright cylinder.
 """
 
@@ -33,11 +33,11 @@ class Piece:
     front: float = 0.5
 
 
-def texture(kind: str, colour: tuple[int, int, int], generator: np.random.Generator) -> NDArray[np.uint8]:
+def texture(kind: str, color: tuple[int, int, int], generator: np.random.Generator) -> NDArray[np.uint8]:
     """A picture that repeats without a seam.
 
     :param kind: "plain", "wood", "fabric", "stripes" or "stone"
-    :param colour: its mean colour
+    :param color: its mean color
     :param generator: draws its details
     :return: uint8 (200, 200, 3)
     """
@@ -50,10 +50,10 @@ def texture(kind: str, colour: tuple[int, int, int], generator: np.random.Genera
         light += 5 * ((np.arange(n)[:, None] // 2 + np.arange(n) // 2) % 2)
     if kind == "stripes":
         light += np.where((np.arange(n) // 20) % 2, 22, -22)
-    return np.asarray(np.clip(np.array(colour) + light[..., None], 0, 255).astype(np.uint8))
+    return np.asarray(np.clip(np.array(color) + light[..., None], 0, 255).astype(np.uint8))
 
 
-# Texture name: (kind, colours to choose from).
+# Texture name: (kind, colors to choose from).
 TEXTURES: dict[str, tuple[str, tuple[tuple[int, int, int], ...]]] = {
     "wall": ("plain", ((86, 82, 80),)),
     "sill": ("stone", ((222, 220, 214),)),

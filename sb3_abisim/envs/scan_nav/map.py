@@ -1,4 +1,4 @@
-"""A scanned place seen from straight above: colours, heights, and where one can walk.
+"""A scanned place seen from straight above: colors, heights, and where one can walk.
 
 An orthographic camera that looks straight down at a place that does not change sees, wherever it is, a part of one
 and the same picture. :class:`ScanMap` is that picture. It is made once from a mesh (:meth:`ScanMap.from_mesh`,
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.common.files import file_digest, write_atomic
+from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.mesh import LEVEL_BIN, ScanMesh, level_areas, load_mesh, warn_missing
@@ -44,16 +44,16 @@ _VERSION = 5
 class MapSettings:
     """How a mesh becomes a map; Habitat's numbers where Habitat has some.
 
-    :param metres_per_pixel: of the map
+    :param meters_per_pixel: of the map
     :param up: the file's upward axis, "y", "z" or "auto"
     :param floor: which storey, 0 being the lowest
     :param cut_height: what hangs higher than this above the floor is taken away, in m
-    :param agent_radius: distance that the agent's centre keeps from obstacles, in m
+    :param agent_radius: distance that the agent's center keeps from obstacles, in m
     :param agent_height: what is higher than this does not stop it, in m
     :param max_climb: what is lower than this does not stop it, in m
     """
 
-    metres_per_pixel: float = 0.02
+    meters_per_pixel: float = 0.02
     up: str = "auto"
     floor: int = 0
     cut_height: float = 2.0
@@ -62,10 +62,10 @@ class MapSettings:
     max_climb: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("metres_per_pixel", "cut_height", "agent_radius", "agent_height", "max_climb"):
+        for name in ("meters_per_pixel", "cut_height", "agent_radius", "agent_height", "max_climb"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1000:
-                raise ValueError(f"{name} must be a number of metres above 0, got {value!r}")
+                raise ValueError(f"{name} must be a number of meters above 0, got {value!r}")
         if isinstance(self.floor, bool) or not isinstance(self.floor, int) or self.floor < 0:
             raise ValueError(f"floor must be a whole number of at least 0, got {self.floor!r}")
         if not self.max_climb < self.agent_height <= self.cut_height:
@@ -81,8 +81,8 @@ class ScanMap:
 
     :param orthophoto: uint8 (height, width, 3), RGB, black where there is no surface
     :param height: float32 (height, width), above the floor in m, nan where there is no surface
-    :param walkable: bool (height, width), where the agent's centre can be
-    :param metres_per_pixel: the size of a pixel
+    :param walkable: bool (height, width), where the agent's center can be
+    :param meters_per_pixel: the size of a pixel
     :param origin: x (east) and y (north) of the map's north-western corner in the scan's own coordinates, in m
     :param source: where it comes from
     :param settings: how it was made, JSON types
@@ -92,7 +92,7 @@ class ScanMap:
     orthophoto: NDArray[np.uint8]
     height: NDArray[np.float32]
     walkable: NDArray[np.bool_]
-    metres_per_pixel: float
+    meters_per_pixel: float
     origin: tuple[float, float]
     source: str
     settings: dict[str, Any] = field(default_factory=dict)
@@ -112,12 +112,12 @@ class ScanMap:
                 )
         if np.isinf(self.height).any():
             raise SceneError(f"{self.source}: height is infinite somewhere; use nan where there is no surface")
-        if not (np.isfinite([self.metres_per_pixel, *self.origin]).all() and self.metres_per_pixel > 0):
+        if not (np.isfinite([self.meters_per_pixel, *self.origin]).all() and self.meters_per_pixel > 0):
             raise SceneError(
-                f"{self.source}: metres_per_pixel {self.metres_per_pixel} must be above 0 and origin {self.origin} "
+                f"{self.source}: meters_per_pixel {self.meters_per_pixel} must be above 0 and origin {self.origin} "
                 "finite"
             )
-        area = float(self.walkable.sum()) * self.metres_per_pixel**2
+        area = float(self.walkable.sum()) * self.meters_per_pixel**2
         if area < MIN_WALKABLE_AREA:
             raise SceneError(
                 f"{self.source}: only {area:.2f} m2 of the floor can be walked on, less than {MIN_WALKABLE_AREA} m2; "
@@ -125,24 +125,24 @@ class ScanMap:
             )
 
     @property
-    def fingerprint(self) -> str:
+    def content_hash(self) -> str:
         """sha256 over everything that an environment can show."""
-        digest = hashlib.sha256(repr((self.metres_per_pixel, self.origin)).encode())
+        sha256 = hashlib.sha256(repr((self.meters_per_pixel, self.origin)).encode())
         for array in (self.orthophoto, self.height, self.walkable):
-            digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()
+            sha256.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        return sha256.hexdigest()
 
     @classmethod
     def from_mesh(cls, path: str | os.PathLike[str], cache: bool = True, **settings: Any) -> "ScanMap":
         """Make the map of a scan, or take it from the cache.
 
-        :param path: a .glb, .gltf, .obj or .ply file with textures or vertex colours
+        :param path: a .glb, .gltf, .obj or .ply file with textures or vertex colors
         :param cache: whether to look in the cache, and write to it
         :param settings: those of :class:`MapSettings`
         :raises SceneError: for whatever is wrong with the file, see docs/scan_nav.md
         """
         path, given = Path(path), _settings(settings)
-        key = [file_digest(path), path.name] if path.is_file() else None
+        key = [file_hash(path), path.name] if path.is_file() else None
 
         def make() -> ScanMap:
             mesh = load_mesh(path, given.up)
@@ -183,7 +183,7 @@ class ScanMap:
                 orthophoto=self.orthophoto,
                 height=self.height,
                 walkable=self.walkable,
-                metres_per_pixel=self.metres_per_pixel,
+                meters_per_pixel=self.meters_per_pixel,
                 origin=np.array(self.origin, dtype=np.float64),
                 source=self.source,
                 settings=json.dumps(self.settings, sort_keys=True),
@@ -209,7 +209,7 @@ class ScanMap:
                     data["orthophoto"],
                     data["height"],
                     data["walkable"],
-                    float(data["metres_per_pixel"]),
+                    float(data["meters_per_pixel"]),
                     (float(origin[0]), float(origin[1])),
                     str(data["source"]),
                     json.loads(str(data["settings"])),
@@ -257,7 +257,7 @@ def _cached(key: list[Any], settings: MapSettings, make: Callable[[], ScanMap], 
 
 
 def _digest(path: Path) -> str:
-    return file_digest(path) if path.is_file() else ""
+    return file_hash(path) if path.is_file() else ""
 
 
 def find_floors(corners: NDArray[np.float64]) -> list[float]:
@@ -297,7 +297,7 @@ def build_map(mesh: ScanMesh, source: str, settings: MapSettings) -> ScanMap:
     What is shown at a pixel: the highest up-facing surface below the cut. Where the first surface above the cut faces
     up, the cut goes through a solid thing (a wall, a wardrobe), and its own top is shown instead.
 
-    :param mesh: z up, in metres
+    :param mesh: z up, in meters
     :param source: for messages and the map
     :param settings: how to make it
     :raises SceneError: for a floor that is not there, too many pixels, or nowhere to walk
@@ -307,7 +307,7 @@ def build_map(mesh: ScanMesh, source: str, settings: MapSettings) -> ScanMap:
     if settings.floor >= len(floors):
         listed = ", ".join(f"{z:.2f} m" for z in floors)
         raise SceneError(f"{source} has no floor {settings.floor}: there are {len(floors)}, at heights {listed}")
-    scale, base = settings.metres_per_pixel, floors[settings.floor]
+    scale, base = settings.meters_per_pixel, floors[settings.floor]
     # A hair's breadth of tolerance: the same scan in another format has other roundings.
     west, south = np.floor(mesh.vertices[:, :2].min(axis=0) / scale + 1e-3) * scale
     east, north = mesh.vertices[:, :2].max(axis=0)
@@ -316,7 +316,7 @@ def build_map(mesh: ScanMesh, source: str, settings: MapSettings) -> ScanMap:
         enough = scale * (width * height / MAX_PIXELS) ** 0.5
         raise SceneError(
             f"{source}: a map of {width} x {height} pixels is larger than {MAX_PIXELS // 10**6} million; raise "
-            f"metres_per_pixel from {scale} to {np.ceil(enough * 1000) / 1000:g} or more"
+            f"meters_per_pixel from {scale} to {np.ceil(enough * 1000) / 1000:g} or more"
         )
     top = south + height * scale
     # Columns, rows and heights above the floor; a mirrored axis turns the faces' orientation round.
@@ -383,10 +383,10 @@ def _walkable(floor: NDArray[np.bool_], obstacle: NDArray[np.bool_], settings: M
     """The largest connected part of the floor that keeps the agent's radius from everything else."""
     from scipy import ndimage
 
-    size = max(1, round(PINHOLE / settings.metres_per_pixel))
+    size = max(1, round(PINHOLE / settings.meters_per_pixel))
     closed = ndimage.binary_closing(np.pad(floor, size), np.ones((size, size)))[size:-size, size:-size]
     free = np.pad((floor | closed) & ~obstacle, 1)
-    distance = ndimage.distance_transform_edt(free)[1:-1, 1:-1] * settings.metres_per_pixel
+    distance = ndimage.distance_transform_edt(free)[1:-1, 1:-1] * settings.meters_per_pixel
     islands, n_islands = ndimage.label(distance > settings.agent_radius)
     if n_islands == 0:
         return np.zeros_like(floor)

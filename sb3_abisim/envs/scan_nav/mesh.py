@@ -1,6 +1,6 @@
-"""Scan files as triangles with colours: everything that can be wrong with a file is found here.
+"""Scan files as triangles with colors: everything that can be wrong with a file is found here.
 
-A :class:`ScanMesh` is z-up, in metres. Files are read by trimesh (``pip install 'sb3_abisim[scan]'``).
+A :class:`ScanMesh` is z-up, in meters. Files are read by trimesh (``pip install 'sb3_abisim[scan]'``).
 """
 
 import io
@@ -17,12 +17,12 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.common.files import file_digest
+from sb3_abisim.common.files import file_hash
 from sb3_abisim.envs.scan_nav.files import SceneError, bare_name, check_file, lost_materials, primitives, texture_uri
 
 UP_AXES = ("auto", "y", "z")
-MISSING_COLOUR = (160, 160, 160)
-# Heights are counted in bins of this many metres.
+MISSING_COLOR = (160, 160, 160)
+# Heights are counted in bins of this many meters.
 LEVEL_BIN = 0.05
 MIN_LEVEL_AREA = 1.5  # m2
 MIN_UP_RATIO = 1.25
@@ -30,18 +30,18 @@ MIN_UP_RATIO = 1.25
 _LEVEL_NORMAL = 0.9
 _EXTENT = (1.0, 200.0)  # m
 _PICTURES = "export it again with PNG or JPEG textures of at most 8192 x 8192 pixels"  # Pillow refuses far larger ones
-_COLOURED_VERTEX = re.compile(rb"^v(?:[ \t]+[-+.\deE]+){6}[ \t\r]*$", re.MULTILINE)  # of an OBJ file
+_COLORED_VERTEX = re.compile(rb"^v(?:[ \t]+[-+.\deE]+){6}[ \t\r]*$", re.MULTILINE)  # of an OBJ file
 _TEXTURE_VERTEX = re.compile(rb"^vt[ \t].*$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A run of faces that share one kind of colouring.
+    """A run of faces that share one kind of coloring.
 
     :param n_faces: their number
     :param texture: uint8 (height, width, 3), or None
     :param coordinates: with a texture, (n_faces, 3, 2) of its u to the right and v upwards, 1 being its whole size, for
-        the three corners of each face; without one, their colours (n_faces, 3, 3) in 0..255
+        the three corners of each face; without one, their colors (n_faces, 3, 3) in 0..255
     """
 
     n_faces: int
@@ -51,11 +51,11 @@ class Surface:
 
 @dataclass(frozen=True)
 class ScanMesh:
-    """Triangles with colours, z up, in metres.
+    """Triangles with colors, z up, in meters.
 
     :param vertices: float64 (n, 3)
     :param faces: int64 (m, 3), counter-clockwise seen from outside
-    :param surfaces: how the faces are coloured, in their order
+    :param surfaces: how the faces are colored, in their order
     :param files: what was read: path relative to the scan's folder, to its sha256, or to "" for a missing file
     """
 
@@ -72,7 +72,7 @@ class ScanMesh:
 def load_mesh(path: str | os.PathLike[str], up: str = "auto") -> ScanMesh:
     """Read a scan.
 
-    :param path: a .glb, .gltf, .obj or .ply file with textures or vertex colours
+    :param path: a .glb, .gltf, .obj or .ply file with textures or vertex colors
     :param up: the file's upward axis, "y" or "z"; "auto" takes the one with the larger horizontal floor
     :raises SceneError: for whatever is wrong with the file
     :raises ImportError: without trimesh
@@ -95,7 +95,7 @@ def load_mesh(path: str | os.PathLike[str], up: str = "auto") -> ScanMesh:
     if not _EXTENT[0] <= extent <= _EXTENT[1]:
         raise SceneError(
             f"{path} is {extent:.3g} m wide, not between {_EXTENT[0]:g} and {_EXTENT[1]:g} m; its units are probably "
-            "not metres: rescale it"
+            "not meters: rescale it"
         )
     return _turn_upright(path, mesh, up)
 
@@ -110,7 +110,7 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
         raise ImportError("reading scans needs trimesh: pip install 'sb3_abisim[scan]'") from error
 
     kind = path.suffix[1:].lower()
-    files = {path.name: file_digest(path)}
+    files = {path.name: file_hash(path)}
     missing: list[str] = []
     damaged: list[str] = []
     libraries: list[bytes] = []  # of an OBJ file's materials
@@ -125,7 +125,7 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
             for candidate in candidates:
                 file = folder / candidate
                 if file.is_file():
-                    files[candidate] = file_digest(file)
+                    files[candidate] = file_hash(file)
                     data = file.read_bytes()
                     if file.suffix.lower() == ".mtl":
                         libraries.append(data)
@@ -158,7 +158,7 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
     if (n_damaged := n_textured - sum(map(_shows_picture, visuals))) > 0:
         raise SceneError(f"{path}: the textures of {n_damaged} of {n_textured} parts cannot be decoded; {_PICTURES}")
     if n_bare := sum(_is_bare(visual) and not _has_lost(visual, lost) for visual in visuals):
-        warnings.warn(f"{path}: {n_bare} of {len(visuals)} parts have no colour and are drawn grey", stacklevel=3)
+        warnings.warn(f"{path}: {n_bare} of {len(visuals)} parts have no color and are drawn gray", stacklevel=3)
     if not parts:
         found = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
         raise SceneError(f"{path} is {found}: it has no faces; export the scan as a mesh of triangles")
@@ -176,10 +176,10 @@ def _is_picture(data: bytes) -> bool:
 
 
 def _load(data: bytes, kind: str, load: Callable[..., Any], missing: list[str]) -> Any:
-    """trimesh's scene, in which an OBJ file's vertices keep their colours unless it shows a texture."""
-    if kind != "obj" or not _COLOURED_VERTEX.search(data):
+    """trimesh's scene, in which an OBJ file's vertices keep their colors unless it shows a texture."""
+    if kind != "obj" or not _COLORED_VERTEX.search(data):
         return load(io.BytesIO(data))
-    # trimesh takes materials and texture coordinates for all there is; MeshLab writes them beside vertices' colours.
+    # trimesh takes materials and texture coordinates for all there is; MeshLab writes them beside vertices' colors.
     bare = _TEXTURE_VERTEX.sub(b"", data)
     if bare != data:
         scene = load(io.BytesIO(data))
@@ -216,7 +216,7 @@ def warn_missing(source: str | os.PathLike[str], names: Iterable[str]) -> None:
     if missing := sorted(set(map(bare_name, names))):
         warnings.warn(
             f"{source} refers to {', '.join(missing)}, which is not there (in the scan's folder); what it covers gets "
-            "a flat colour",
+            "a flat color",
             stacklevel=4,
         )
 
@@ -244,26 +244,26 @@ def _surface(visual: Any, faces: NDArray[np.int64], lost: Callable[[Any], bool])
             pixels = np.asarray(image.convert("RGB"), dtype=np.float32) * (factor / 255)
             texture = np.rint(pixels).astype(np.uint8)
             return Surface(len(faces), texture, np.asarray(visual.uv, dtype=np.float32)[faces])
-        # An untextured material has its own colour, unless it has lost its texture.
-        # glTF multiplies it by the vertices' colours.
-        colours = visual.vertex_attributes.get("color")
-        if colours is not None and not lost(visual.material):
-            largest = np.iinfo(colours.dtype).max if colours.dtype.kind == "u" else 1.0
-            shown = np.asarray(colours, dtype=np.float32)[:, :3] / np.float32(largest) * factor
+        # An untextured material has its own color, unless it has lost its texture.
+        # glTF multiplies it by the vertices' colors.
+        colors = visual.vertex_attributes.get("color")
+        if colors is not None and not lost(visual.material):
+            largest = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0
+            shown = np.asarray(colors, dtype=np.float32)[:, :3] / np.float32(largest) * factor
             return Surface(len(faces), None, shown[faces])
-        flat = np.array(MISSING_COLOUR if lost(visual.material) else factor, dtype=np.float32)
+        flat = np.array(MISSING_COLOR if lost(visual.material) else factor, dtype=np.float32)
         return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
     if visual.kind == "vertex":
         return Surface(len(faces), None, np.asarray(visual.vertex_colors, dtype=np.float32)[faces][..., :3])
     if visual.kind == "face":
-        colours = np.asarray(visual.face_colors, dtype=np.float32)[:, None, :3]
-        return Surface(len(faces), None, np.broadcast_to(colours, (len(faces), 3, 3)))
-    flat = np.array(MISSING_COLOUR, dtype=np.float32)
+        colors = np.asarray(visual.face_colors, dtype=np.float32)[:, None, :3]
+        return Surface(len(faces), None, np.broadcast_to(colors, (len(faces), 3, 3)))
+    flat = np.array(MISSING_COLOR, dtype=np.float32)
     return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
 
 
 def _material(material: Any) -> tuple[Any, NDArray[np.float32]]:
-    """Image and base colour (0..255, as shown on a screen) of a glTF or OBJ material."""
+    """Image and base color (0..255, as shown on a screen) of a glTF or OBJ material."""
     if hasattr(material, "baseColorFactor"):
         factor, image = material.baseColorFactor, material.baseColorTexture
         if factor is None:
@@ -271,19 +271,19 @@ def _material(material: Any) -> tuple[Any, NDArray[np.float32]]:
         linear = np.asarray(factor, dtype=np.float32)[:3] / 255
         # glTF's factors are linear light.
         return image, (255 * np.clip(linear, 0, 1) ** (1 / 2.2)).astype(np.float32)
-    # trimesh gives coordinates without a material a grey picture of its own, which has no file format.
+    # trimesh gives coordinates without a material a gray picture of its own, which has no file format.
     if material.image is not None and material.image.format:
-        # Many OBJ exporters write a grey or black Kd beside the texture and mean the texture alone.
+        # Many OBJ exporters write a gray or black Kd beside the texture and mean the texture alone.
         return material.image, np.full(3, 255, dtype=np.float32)
-    # trimesh's diffuse colour is another grey where the file has none.
-    return None, np.array(material.diffuse[:3] if "kd" in material.kwargs else MISSING_COLOUR, dtype=np.float32)
+    # trimesh's diffuse color is another gray where the file has none.
+    return None, np.array(material.diffuse[:3] if "kd" in material.kwargs else MISSING_COLOR, dtype=np.float32)
 
 
 def level_areas(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """How much level, up-facing area there is at which height.
 
     :param corners: of the faces, (m, 3, 3), z up
-    :return: the bins' middle heights in m, and areas in m2 of each bin together with its two neighbours
+    :return: the bins' middle heights in m, and areas in m2 of each bin together with its two neighbors
     """
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
@@ -311,6 +311,6 @@ def _turn_upright(path: Path, mesh: ScanMesh, up: str) -> ScanMesh:
     if area < MIN_LEVEL_AREA:
         raise SceneError(
             f"{path} has no floor: its largest horizontal level has {area:.2f} m2 with {up} up, less than "
-            f"{MIN_LEVEL_AREA} m2; turn it so that gravity points along an axis, and check its units (metres)"
+            f"{MIN_LEVEL_AREA} m2; turn it so that gravity points along an axis, and check its units (meters)"
         )
     return ScanMesh(turned[up], mesh.faces, mesh.surfaces, mesh.files)

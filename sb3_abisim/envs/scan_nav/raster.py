@@ -1,7 +1,7 @@
 """Triangles on a grid of pixels, seen from straight above.
 
-Pixel (row r, column c) has its centre at (c + 0.5, r + 0.5). A triangle covers the centres inside it; of two that
-share an edge exactly one covers a centre on it, because both compute the edge's crossing with a row alike.
+Pixel (row r, column c) has its center at (c + 0.5, r + 0.5). A triangle covers the centers inside it; of two that
+share an edge exactly one covers a center on it, because both compute the edge's crossing with a row alike.
 """
 
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ def _expand(counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.in
 
 
 def fragments(corners: NDArray[np.float64], height: int, width: int) -> Iterator[Fragments]:
-    """The pixels whose centres the triangles cover.
+    """The pixels whose centers the triangles cover.
 
     :param corners: of each triangle, (m, 3, 3): column and row in pixels, height in any unit
     :param height: of the grid, in pixels
@@ -107,10 +107,10 @@ def shade(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
 ) -> NDArray[np.uint8]:
-    """The colours of points on triangles.
+    """The colors of points on triangles.
 
     :param corners: of all triangles, (m, 3, 3); only the first two coordinates are read
-    :param surfaces: their colouring, in their order
+    :param surfaces: their coloring, in their order
     :param face: triangle of each point, (n,)
     :param x: first coordinate of each point
     :param y: second coordinate of each point
@@ -122,7 +122,7 @@ def shade(
     beta = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
     gamma = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
     weights = np.clip(np.stack([1 - beta - gamma, beta, gamma], axis=1), 0, 1)
-    colours = np.zeros((len(face), 3), dtype=np.uint8)
+    colors = np.zeros((len(face), 3), dtype=np.uint8)
     ends = np.cumsum([surface.n_faces for surface in surfaces])
     owner = np.searchsorted(ends, face, side="right")
     for k in np.unique(owner):
@@ -130,8 +130,8 @@ def shade(
         corner_values = surface.coordinates[face[mine] - (ends[k] - surface.n_faces)]
         values = np.einsum("nk,nkd->nd", weights[mine], corner_values)
         rgb = values if surface.texture is None else _sample(surface.texture, values)
-        colours[mine] = np.rint(np.clip(rgb, 0, 255)).astype(np.uint8)
-    return colours
+        colors[mine] = np.rint(np.clip(rgb, 0, 255)).astype(np.uint8)
+    return colors
 
 
 def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:

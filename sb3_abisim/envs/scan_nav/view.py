@@ -11,8 +11,8 @@ CAMERA_HEIGHT = 3.0  # m above the floor
 MAX_DEPTH = 10.0  # m, Habitat's
 YELLOW, MAGENTA = (255, 214, 0), (255, 0, 200)
 _OCTAGON = tuple((0.13 * math.cos(a), 0.13 * math.sin(a)) for a in (math.pi * (k + 0.5) / 4 for k in range(8)))
-# The agent's marker: convex parts, a later one over an earlier. Of each its colour and its corners in m, ahead of the
-# agent's centre and to its left, counter-clockwise. The body of the arrow is as good as round, its nose has a colour of
+# The agent's marker: convex parts, a later one over an earlier. Of each its color and its corners in m, ahead of the
+# agent's center and to its left, counter-clockwise. The body of the arrow is as good as round, its nose has a color of
 # its own. Which way a plain triangle turns can be seen from its direction modulo 120 degrees: inverse dynamics had
 # no use for more, and agents on such encoders did not know ahead from behind (docs/scan_nav.md).
 MARKERS: dict[str, tuple[tuple[tuple[int, int, int], tuple[tuple[float, float], ...]], ...]] = {
@@ -27,11 +27,11 @@ SAMPLES = 4
 class SceneView:
     """A map at the scale of the observations, with a border as wide as half a view around it.
 
-    Each pixel has the area-weighted mean of the map's colours and depths under it; what lies beyond the map is a hole.
+    Each pixel has the area-weighted mean of the map's colors and depths under it; what lies beyond the map is a hole.
 
     :param scan: the map
     :param image_size: pixels of a view per side, even
-    :param view_size: metres of a view per side
+    :param view_size: meters of a view per side
     """
 
     def __init__(self, scan: ScanMap, image_size: int, view_size: float) -> None:
@@ -40,15 +40,15 @@ class SceneView:
         surface = ~np.isnan(scan.height)
         above = np.nan_to_num(scan.height)
         nearness = np.where(surface, np.clip((CAMERA_HEIGHT - above) / CAMERA_HEIGHT, 0, 1), 0)
-        metres = np.where(surface, np.clip(CAMERA_HEIGHT - above, 0, MAX_DEPTH) / MAX_DEPTH, 0)
-        channels = [*np.moveaxis(scan.orthophoto, -1, 0), 255 * nearness, metres]
-        ratio = self.pitch / scan.metres_per_pixel
+        meters = np.where(surface, np.clip(CAMERA_HEIGHT - above, 0, MAX_DEPTH) / MAX_DEPTH, 0)
+        channels = [*np.moveaxis(scan.orthophoto, -1, 0), 255 * nearness, meters]
+        ratio = self.pitch / scan.meters_per_pixel
         averaged = [area_means(np.asarray(c, dtype=np.float64), ratio) for c in channels]
         border = image_size // 2
         padded = np.pad(np.stack(averaged), ((0, 0), (border, border), (border, border)))
         # uint8 (4, ...): red, green, blue, depth in 255 parts of the camera's height.
         self.rgbd = np.rint(padded[:4]).astype(np.uint8)
-        # float32, Habitat's depth: metres / MAX_DEPTH.
+        # float32, Habitat's depth: meters / MAX_DEPTH.
         self.depth = padded[4].astype(np.float32)
 
 
@@ -71,30 +71,30 @@ def area_means(picture: NDArray[np.float64], ratio: float) -> NDArray[np.float64
 
 
 class MarkerPainter:
-    """Draws the agent, convex polygons that turn with it, into the colours of frames.
+    """Draws the agent, convex polygons that turn with it, into the colors of frames.
 
     :param marker: a key of :data:`MARKERS`
     :param image_size: of the frames
-    :param pitch: metres per pixel
+    :param pitch: meters per pixel
     """
 
     def __init__(self, marker: str, image_size: int, pitch: float) -> None:
-        self._parts = [_PartPainter(colour, corners, image_size, pitch) for colour, corners in MARKERS[marker]]
+        self._parts = [_PartPainter(color, corners, image_size, pitch) for color, corners in MARKERS[marker]]
 
-    def draw(self, frames: NDArray[np.uint8], centres: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
+    def draw(self, frames: NDArray[np.uint8], centers: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
         """Draw one marker into each frame, in place.
 
         :param frames: contiguous, (n, 3 or more, image_size, image_size); the first three channels are drawn on
-        :param centres: (column, row) in pixels, at least the marker's radius and two pixels from the border
+        :param centers: (column, row) in pixels, at least the marker's radius and two pixels from the border
         :param headings: in degrees, 0 is up and 90 is left
         """
         for part in self._parts:
-            part.draw(frames, centres, headings)
+            part.draw(frames, centers, headings)
 
 
 class _PartPainter:
     def __init__(
-        self, colour: tuple[int, int, int], corners_in_m: tuple[tuple[float, float], ...], image_size: int, pitch: float
+        self, color: tuple[int, int, int], corners_in_m: tuple[tuple[float, float], ...], image_size: int, pitch: float
     ) -> None:
         corners = np.array(corners_in_m) / pitch
         following = np.roll(corners, -1, axis=0)
@@ -108,11 +108,11 @@ class _PartPainter:
         self._points = (np.arange(self._size * SAMPLES) + 0.5) / SAMPLES
         steps = np.arange(self._size)[:, None] * image_size + np.arange(self._size)
         self._where = np.arange(3)[:, None, None] * image_size**2 + steps
-        self._colour = np.array(colour, dtype=np.uint32)[:, None, None]
+        self._color = np.array(color, dtype=np.uint32)[:, None, None]
 
-    def draw(self, frames: NDArray[np.uint8], centres: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
-        corner = np.floor(centres - self._radius).astype(np.int64)
-        points = corner[:, :, None] + self._points - centres[:, :, None]
+    def draw(self, frames: NDArray[np.uint8], centers: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
+        corner = np.floor(centers - self._radius).astype(np.int64)
+        points = corner[:, :, None] + self._points - centers[:, :, None]
         angle = np.deg2rad(headings)[:, None]
         ahead, left = self._normals.T
         # Ahead is (-sin, -cos) in columns and rows, left is (-cos, sin).
@@ -128,12 +128,12 @@ class _PartPainter:
         flat = frames.reshape(-1)
         where = starts[:, None, None, None] + self._where
         below, share, whole = flat[where].astype(np.uint32), share[:, None], SAMPLES**2
-        flat[where] = (below * (whole - share) + self._colour * share + whole // 2) // whole
+        flat[where] = (below * (whole - share) + self._color * share + whole // 2) // whole
 
 
 def _count_samples(inside: NDArray[np.bool_]) -> NDArray[np.uint32]:
     """How many of the 4 x 4 points of each pixel are true: (n, 4 h, 4 w) to (n, h, w)."""
-    # Four neighbouring bytes are one number; its bytes are added up by the multiplication, in the topmost one.
+    # Four neighboring bytes are one number; its bytes are added up by the multiplication, in the topmost one.
     words = inside.view(np.uint32)
     rows = words[:, 0::4] + words[:, 1::4] + words[:, 2::4] + words[:, 3::4]
     counts: NDArray[np.uint32] = (rows * np.uint32(0x01010101)) >> np.uint32(24)

@@ -1,7 +1,7 @@
 """Where one can walk in ScanNav and how far it is: goals, geodesic distances, starts, steps.
 
 Everything about a goal happens on a square grid of nodes around it, its *field*: the geodesic distance of each node to
-the goal, infinite where there is no way inside the view. Positions are in metres east and north of the goal.
+the goal, infinite where there is no way inside the view. Positions are in meters east and north of the goal.
 """
 
 import math
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.map import ScanMap
 
-NODE = 0.05  # m between neighbouring nodes
+NODE = 0.05  # m between neighboring nodes
 # A goal is used if this share of points drawn in its view are starts, so that drawing one ends soon.
 MIN_START_SHARE = 0.005
 # Places of a scene that are tried as goals before it is refused.
@@ -38,7 +38,7 @@ _WAYS: tuple[tuple[tuple[int, int], tuple[tuple[int, int], ...]], ...] = (
 class DistanceGrid:
     """Geodesic distances to the middle of a square grid of nodes.
 
-    Ways lead to 16 neighbours (those of a king and of a knight in chess), so a distance is too long by 2.7 % at most.
+    Ways lead to 16 neighbors (those of a king and of a knight in chess), so a distance is too long by 2.7 % at most.
 
     :param half: nodes on each side of the middle one
     """
@@ -210,7 +210,7 @@ class ScanWorld:
 
     def _compute(self, scene: int, corner: NDArray[np.int64]) -> NDArray[np.float32]:
         scan, offsets = self.scans[scene], np.arange(-self.half, self.half + 1) * NODE
-        scale, (height, width) = scan.metres_per_pixel, scan.walkable.shape
+        scale, (height, width) = scan.meters_per_pixel, scan.walkable.shape
         rows, columns = (np.floor((k * self.pitch + offsets) / scale).astype(np.int64) for k in corner)
         known = ((rows >= 0) & (rows < height))[:, None] & (columns >= 0) & (columns < width)
         free = scan.walkable[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)] & known
@@ -339,7 +339,7 @@ class ScanWorld:
 
 def _places(scan: ScanMap, pitch: float) -> NDArray[np.int64]:
     """Walkable corners of observation pixels, (n, 2) rows and columns, in an order drawn once and for all."""
-    walkable, ratio = scan.walkable, pitch / scan.metres_per_pixel
+    walkable, ratio = scan.walkable, pitch / scan.meters_per_pixel
     rows, columns = (
         np.minimum((np.arange(int(n / ratio) + 1) * ratio).astype(np.int64), n - 1) for n in walkable.shape
     )

@@ -1,0 +1,209 @@
+"""What names a job, and what a changed setting changes."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+from zoo_inputs import write_encoder
+
+from sb3_abisim.benchmark.plan import Job, Plan, build, run_labels
+from sb3_abisim.zoo.methods import DISTRACTOR_IDS
+
+PLAN = Plan(methods=("abisim", "ssi", "vanilla"), env_ids=("Nav2D-v0", "DistractorPointMaze-v0"), seeds=(0, 1))
+
+
+def names(jobs: list[Job]) -> set[str]:
+    return {job.name for job in jobs}
+
+
+def changed(**changes: object) -> list[str]:
+    """Titles of the jobs that a plan with other settings has and the plan has not."""
+    there = names(build(PLAN))
+    return sorted(job.title for job in build(dataclasses.replace(PLAN, **changes)) if job.name not in there)
+
+
+def test_every_cell_once_and_after_its_inputs() -> None:
+    jobs = build(PLAN)
+    seen: set[str] = set()
+    for job in jobs:
+        assert job.name not in seen
+        assert {source.name for source in job.inputs} <= seen
+        seen.add(job.name)
+    # One dataset per environment; two encoders per objective, environment and seed; a run and its evaluation for each.
+    kinds = [job.kind for job in jobs]
+    assert {kind: kinds.count(kind) for kind in kinds} == {"data": 2, "encoder": 8, "run": 12, "final": 12}
+    assert len({job.output for job in jobs if job.kind == "run"}) == 12
+
+
+def test_c_reruns_what_depends_on_it_and_nothing_else() -> None:
+    found = changed(pretrain_params=("abisim.objective_kwargs.c:0.5",))
+    expected = []
+    for env_id, algo in (("Nav2D-v0", "dqn"), ("DistractorPointMaze-v0", "ppo")):
+        for seed in (0, 1):
+            expected.append(f"pretrain abisim {env_id} seed {seed}")
+            expected += [f"{algo} abisim {env_id} seed {seed}", f"{algo} final abisim {env_id} seed {seed}"]
+    assert found == sorted(expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"params": ("dqn.gamma:0.9",)}, {"dqn", "dqn final"}),
+        ({"params": ("ppo.gamma:0.9",)}, {"ppo", "ppo final"}),
+        ({"eval_episodes": 7}, {"dqn", "dqn final", "ppo", "ppo final"}),
+        ({"final_episodes": 7}, {"dqn final", "ppo final"}),
+        ({"device": "cpu"}, set()),
+        ({"threads": 2}, set()),
+        ({"seeds": (1, 0), "encoder_seeds": (1, 0)}, set()),
+    ],
+)
+def test_what_a_setting_reaches(changes: dict[str, object], expected: set[str]) -> None:
+    plan = {"methods": ("vanilla",)}
+    there = names(build(dataclasses.replace(PLAN, **plan)))
+    fresh = [job for job in build(dataclasses.replace(PLAN, **plan, **changes)) if job.name not in there]
+    assert {job.title.partition(" vanilla")[0] for job in fresh} == expected
+
+
+def test_the_base_encoder_reaches_those_that_rest_on_it() -> None:
+    titles = changed(pretrain_params=("ssi.batch_size:128",))
+    assert not [title for title in titles if "vanilla" in title or "collect" in title]
+    assert len(titles) == 8 + 16, "both encoders of each seed and environment, their runs and the evaluations"
+
+
+@pytest.mark.parametrize(
+    "word", ["objective_kwargs.c:0.9", "abisim.objective_kwargs.cc:0.9", "ssi.objective_kwargs.k:3"]
+)
+def test_unknown_settings_of_an_objective_are_refused_before_anything_runs(word: str) -> None:
+    with pytest.raises(ValueError, match=r"(ssi|abisim) has no objective_kwargs\.(c|cc|k), only .*l1_penalty"):
+        build(dataclasses.replace(PLAN, pretrain_params=(word,)))
+
+
+def test_the_commands_carry_the_settings() -> None:
+    plan = dataclasses.replace(
+        PLAN, methods=("abisim,frozen",), env_ids=("Nav2D-v0",), n_timesteps=500, eval_freq=50, params=("gamma:0.9",),
+        pretrain_params=("n_updates:7", "ssi.batch_size:8"), n_transitions=300,
+    )  # fmt: skip
+    by_title = {job.title: job for job in build(plan)}
+    run = " ".join(by_title["dqn abisim,frozen Nav2D-v0 seed 1"].command)
+    encoder = by_title["pretrain abisim Nav2D-v0 seed 1"]
+    assert f"--conf-file abisim={encoder.output},frozen " in run
+    assert "-n 500 --seed 1 --eval-freq 50 --eval-episodes 20 --n-eval-envs 5" in run and run.endswith(
+        "-params gamma:0.9"
+    )
+    base = by_title["pretrain ssi Nav2D-v0 seed 1"]
+    assert base.command[-2:] == ("n_updates:7", "batch_size:8") and encoder.command[-1:] == ("n_updates:7",)
+    assert encoder.command[encoder.command.index("--base") + 1] == base.output
+    assert encoder.cost == 7 and "-n 300" in " ".join(by_title["collect Nav2D-v0"].command)
+
+
+def test_runs_that_differ_in_seeds_share_a_folder_and_no_others_do() -> None:
+    runs = [job for job in build(PLAN) if job.kind == "run"]
+    folders = {job.output.rpartition("/")[0] for job in runs}
+    assert len(folders) == len(PLAN.methods) * len(PLAN.env_ids)
+    other = build(dataclasses.replace(PLAN, pretrain_params=("abisim.objective_kwargs.c:0.5",)))
+    fresh = {job.output.rpartition("/")[0] for job in other if job.kind == "run"} - folders
+    assert len(fresh) == 2 and all("/abisim-" in folder for folder in fresh)
+    # rl_zoo3's --exp-id takes a number.
+    assert all(job.output.rpartition("_")[2].isdigit() for job in runs)
+
+
+def test_encoders_are_taken_in_turn() -> None:
+    plan = dataclasses.replace(PLAN, methods=("ssi",), env_ids=("Nav2D-v0",), seeds=(0, 1, 2), encoder_seeds=(7, 8))
+    seeds = [job.inputs[0].settings["seed"] for job in build(plan) if job.kind == "run"]
+    assert seeds == [7, 8, 7]
+
+
+def test_a_given_encoder_is_known_by_its_content() -> None:
+    plan = dataclasses.replace(PLAN, methods=("ssi=Nav2D-v0/ssi",), env_ids=("Nav2D-v0",), seeds=(0,))
+    (run,) = (job for job in build(plan) if job.kind == "run")
+    assert run.inputs == () and len(run.settings["encoder_hash"]) == 64
+    assert "ssi=Nav2D-v0/ssi" in run.command
+    assert run_labels([run]) == {run.name: "ssi"}, "as the paper's table calls it"
+    several = build(dataclasses.replace(plan, methods=("ssi", "ssi=Nav2D-v0/ssi", "ssi=Nav2D-v0/ssi,frozen")))
+    labels = list(run_labels(several).values())
+    assert labels == ["ssi", "ssi=ssi", "ssi,frozen"]
+
+
+def test_labels_of_several_given_encoders(tmp_path: Path) -> None:
+    words = []
+    for name in ("a/x_{seed}.safetensors", "b/x_{seed}.safetensors", "b/y.safetensors", "b/y_{seed}.safetensors"):
+        path = tmp_path / ("x" * (len(words) + 1))  # write_encoder draws by the length of the name
+        write_encoder(path, "Nav2D-v0", "ssi")
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        path.rename(tmp_path / name.replace("{seed}", "7"))
+        words.append(f"ssi={tmp_path / name}")
+    plan = dataclasses.replace(
+        PLAN, methods=(*words, "acro=Nav2D-v0/acro,frozen"), env_ids=("Nav2D-v0",), seeds=(0,), encoder_seeds=(7,)
+    )
+    # Where only {seed} tells two apart, they keep their whole names.
+    alike = [f"ssi={tmp_path}/b/y.safetensors", f"ssi={tmp_path}/b/y_{{seed}}.safetensors"]
+    assert list(run_labels(build(plan)).values()) == ["ssi=a/x", "ssi=b/x", *alike, "acro,frozen"]
+
+
+def test_given_encoders_of_several_seeds(tmp_path: Path) -> None:
+    for seed in (3, 4):
+        path = tmp_path / ("x" * seed)  # write_encoder draws by the length of the name
+        write_encoder(path, "Nav2D-v0", "ssi")
+        path.rename(tmp_path / f"ssi{seed}")
+    plan = dataclasses.replace(PLAN, env_ids=("Nav2D-v0",), seeds=(0, 1, 2), encoder_seeds=(3, 4))
+    runs = [
+        c for c in build(dataclasses.replace(plan, methods=(f"ssi={tmp_path}/ssi{{seed}},frozen",))) if c.kind == "run"
+    ]
+    files = [word for job in runs for word in job.command if word.startswith("ssi=")]
+    assert files == [f"ssi={tmp_path}/ssi{seed},frozen" for seed in (3, 4, 3)]
+    assert set(run_labels(runs).values()) == {"ssi,frozen"}, "one method, not one per file"
+    with pytest.raises(FileNotFoundError, match="ssi5"):
+        build(dataclasses.replace(plan, methods=(f"ssi={tmp_path}/ssi{{seed}}",), encoder_seeds=(5,)))
+
+
+def test_random_agents_of_scan_nav_do_not_stop_at_once() -> None:
+    jobs = {job.kind: job for job in build(Plan(methods=("ssi",), env_ids=("ScanNav-v0",), seeds=(0,)))}
+    assert jobs["data"].command[-2:] == ("--env-kwargs", "stop:'auto'")
+    assert jobs["data"].settings["env_kwargs"] == {"stop": "auto"} and jobs["data"].cost == 100_000
+    assert jobs["run"].inputs[0].inputs == (jobs["data"],)
+
+
+def test_distractors_are_evaluated_on_three_splits() -> None:
+    for job in build(PLAN):
+        if job.kind == "final":
+            distracted = job.inputs[0].settings["env_id"] in DISTRACTOR_IDS
+            assert job.settings["splits"] == (["eval", "train", "clean"] if distracted else [])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"methods": ("abisim=Nav2D-v0/abisim", "vanilla"), "params": ("env_kwargs:dict(max_episode_steps=20)",)},
+        {"params": ("ppo.normalize:True",), "final_episodes": 0},
+    ],
+)
+def test_settings_that_nothing_else_would_miss(changes: dict[str, object]) -> None:
+    """Arguments of environments where nothing is pretrained, and wrappers where no final evaluation is made."""
+    assert build(dataclasses.replace(PLAN, **{"env_ids": ("Nav2D-v0",), "algo": "ppo", **changes}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"methods": ("abisym",)}, "unknown method 'abisym'"),
+        ({"methods": ("ssi", "ssi")}, "each once, got ssi ssi"),
+        ({"env_ids": ("Nav3D-v0",)}, "unknown environment 'Nav3D-v0'"),
+        ({"seeds": ()}, "seeds must be given"),
+        ({"seeds": (-1,)}, "seeds must be at least 0, got -1"),
+        ({"n_timesteps": 0}, "n_timesteps must be at least 1, got 0"),
+        ({"algo": "sac"}, "no hyperparameters of sac for Nav2D-v0"),
+        ({"params": ("sac.gamma:0.9",)}, "--params sac.gamma:0.9 is for sac, but here is only dqn, ppo"),
+        ({"params": ("env_kwargs:dict(color_jitter=False)",)}, "would hold for RL, but not for the data"),
+        ({"params": ("frame_stack:2",)}, "dqn has no hyperparameter 'frame_stack'"),
+        ({"params": ("ppo.normalize:True",)}, "evaluation is made without normalize; .* --final-episodes 0"),
+        ({"pretrain_params": ("curl.n_updates:3",)}, "curl.n_updates:3 is for curl, but here is only abisim, ssi"),
+        ({"params": ("gamma",)}, "name:value, got 'gamma'"),
+        ({"params": ("dqn.learning_rat:1e-4",)}, "dqn has no hyperparameter 'learning_rat', only .*learning_rate"),
+        ({"params": ("ppo.seed:3",)}, "--params seed would not hold; give --seeds"),
+        ({"params": ("policy_kwargs:dict()",)}, "-params policy_kwargs would undo --conf-file"),
+        ({"pretrain_params": ("n_update:3",)}, "unknown pretraining setting n_update"),
+    ],
+)
+def test_mistakes_are_named(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(dataclasses.replace(PLAN, **changes))

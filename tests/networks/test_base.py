@@ -1,0 +1,137 @@
+"""The encoders have the sizes that the paper gives, see -1..1, and are rebuilt from their specs."""
+
+import copy
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_abisim.networks.base import ENCODERS, make_encoder
+
+
+def image_space(*shape):
+    return gym.spaces.Box(0, 255, shape, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("shape", "features_dim"),
+    [((3, 15, 15), 576), ((3, 64, 64), 32), ((4, 128, 128), 2048), ((4, 256, 256), 2048)],
+)
+def test_paper_sizes(shape, features_dim):
+    encoder = make_encoder(image_space(*shape))
+    assert encoder(th.rand(2, *shape)).shape == (2, features_dim) and encoder.features_dim == features_dim
+
+
+@pytest.mark.parametrize(("shape", "features_dim"), [((3, 15, 15), 144), ((3, 64, 64), 50)])
+def test_other_sizes_of_the_embedding(shape, features_dim):
+    encoder = make_encoder(image_space(*shape), features_dim=features_dim)
+    assert encoder(th.rand(2, *shape)).shape == (2, features_dim) and encoder.features_dim == features_dim
+    assert encoder.spec()["kwargs"]["features_dim"] == features_dim
+
+
+@pytest.mark.parametrize("features_dim", [0, -9, 100])
+def test_sizes_that_nav2d_cannot_have(features_dim):
+    with pytest.raises(ValueError, match=f"features_dim must be a multiple of 9, got {features_dim}"):
+        make_encoder(image_space(3, 15, 15), features_dim=features_dim)
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_spec_rebuilds_the_network(name):
+    shape = ENCODERS[name].observation_shape
+    encoder = make_encoder(image_space(*shape), name)
+    spec = encoder.spec()
+    again = make_encoder(image_space(*shape), spec["name"], **spec["kwargs"])
+    again.load_state_dict(encoder.state_dict())
+    x = th.rand(2, *shape)
+    assert th.equal(encoder(x), again(x))
+
+
+def is_channels_last(module):
+    weights = [m.weight for m in module.modules() if isinstance(m, th.nn.Conv2d) and m.weight[0, 0].numel() > 1]
+    return bool(weights) and all(w.is_contiguous(memory_format=th.channels_last) for w in weights)
+
+
+@pytest.mark.parametrize("name", ENCODERS)
+def test_weights_lie_channels_last(name):
+    """However they got there: built, initialized as SB3 does, copied, or read from another layout."""
+    encoder = make_encoder(image_space(*ENCODERS[name].observation_shape), name)
+    holder = th.nn.Sequential(encoder)
+    holder.apply(ActorCriticPolicy.init_weights)
+    assert is_channels_last(encoder) and is_channels_last(copy.deepcopy(encoder))
+    encoder.load_state_dict({k: w.contiguous() for k, w in encoder.state_dict().items()})
+    assert is_channels_last(encoder)
+
+
+@pytest.mark.parametrize("size", [64, 128, 256])
+def test_habitats_resnet(size):
+    """Sizes and numbers of weights of habitat-baselines' encoder."""
+    encoder = make_encoder(image_space(4, size, size), "ScanNavResNet18", image_size=size)
+    assert encoder(th.rand(1, 4, size, size)).shape == (1, 2048)
+    n_backbone = sum(p.numel() for p in encoder.layers[1].parameters())
+    assert n_backbone == 2_800_448
+    n_channels = {64: 2048, 128: 512, 256: 128}[size]
+    assert sum(p.numel() for p in encoder.parameters()) == n_backbone + n_channels * (256 * 9 + 2)
+    assert encoder.layers[1](th.rand(1, 4, size // 2, size // 2)).shape == (1, 256, size // 64, size // 64)
+    with pytest.raises(ValueError, match="image_size must be 64, 128 or 256, got 96"):
+        make_encoder(image_space(4, 96, 96), "ScanNavResNet18", image_size=96)
+
+
+def test_inputs_are_mapped_to_plus_minus_one():
+    encoder = make_encoder(image_space(3, 15, 15))
+    seen = []
+    encoder.layers.register_forward_pre_hook(lambda module, args: seen.append(args[0]))
+    encoder(th.tensor([0.0, 0.5, 1.0]).repeat_interleave(225).reshape(1, 3, 15, 15))
+    assert seen[0][0, :, 4, 4].tolist() == [-1.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "name", "kwargs", "message"),
+    [
+        ((3, 20, 20), None, {}, "no default encoder"),
+        ((3, 64, 64), "ResNet", {}, "ResNet"),
+        ((3, 64, 64), "PointMazeEncoder", {"width": 3}, "width"),
+        ((3, 15, 15), "PointMazeEncoder", {}, "shape"),
+        ((4, 64, 64), "PointMazeEncoder", {}, "shape"),
+    ],
+    ids=str,
+)
+def test_refuses(shape, name, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_encoder(image_space(*shape), name, **kwargs)
+
+
+def test_other_channel_counts():
+    encoder = make_encoder(image_space(4, 64, 64), "PointMazeEncoder", n_input_channels=4, features_dim=7)
+    assert encoder(th.rand(1, 4, 64, 64)).shape == (1, 7)
+
+
+def test_standardize_keeps_ratios_of_distances():
+    th.manual_seed(0)
+    encoder = make_encoder(image_space(3, 15, 15))
+    x, y = th.rand(500, 3, 15, 15), th.rand(20, 3, 15, 15)
+    before = th.cdist(encoder(y), encoder(y), p=1).detach()
+    for _ in range(2):
+        encoder.standardize(x)
+        z = encoder(x)
+        assert th.allclose(z.mean(dim=0), th.zeros(576), atol=1e-4)
+        assert float(z.detach().var(dim=0, correction=0).mean()) == pytest.approx(1.0, rel=1e-4)
+    after = th.cdist(encoder(y), encoder(y), p=1).detach()
+    ratios = (after / before)[~th.eye(20, dtype=th.bool)]
+    assert float(ratios.max() / ratios.min()) == pytest.approx(1.0, rel=1e-3) and float(ratios.mean()) != 1.0
+
+
+def test_standardize_refuses_a_collapsed_embedding():
+    encoder = make_encoder(image_space(3, 15, 15))
+    with pytest.raises(ValueError, match="collapsed"):
+        encoder.standardize(th.zeros(4, 3, 15, 15))
+
+
+def test_weights_are_float32_whatever_the_default_is():
+    th.set_default_dtype(th.float64)
+    try:
+        encoder = make_encoder(image_space(3, 15, 15))
+    finally:
+        th.set_default_dtype(th.float32)
+    assert {parameter.dtype for parameter in encoder.parameters()} == {th.float32}

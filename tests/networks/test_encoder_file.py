@@ -1,0 +1,345 @@
+"""The encoder file: what comes back, and what is refused."""
+
+import hashlib
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch as th
+from gymnasium import spaces
+
+from sb3_abisim.networks import encoder_file as checkpoint
+from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
+
+SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
+ACTIONS = spaces.Box(np.array([-1, -2], np.float32), np.array([3, 4], np.float32))
+FRAMES = np.random.default_rng(0).integers(0, 256, (5, 3, 15, 15), np.uint8)
+DATASET_DIGEST = "0" * 64
+
+
+def seeded_encoder(seed: int = 0) -> Encoder:
+    th.manual_seed(seed)
+    return make_encoder(SPACE)
+
+
+def save(path: Path, encoder: Encoder | None = None, **changes: Any) -> str:
+    arguments: dict[str, Any] = {
+        "observation_space": SPACE,
+        "action_space": ACTIONS,
+        "env_id": "Nav2D-v0",
+        "env_kwargs": {"n_obstacles": 3},
+        "objective": "ssi",
+        "settings": {"beta": 0.5, "digest": "0" * 64},
+        "dataset_digest": DATASET_DIGEST,
+        "golden_observations": FRAMES,
+    }
+    return save_encoder(path, encoder or seeded_encoder(), **(arguments | changes))
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    save(tmp_path / "encoder.safetensors")
+    return tmp_path / "encoder.safetensors"
+
+
+def write_with_digest(path: Path, tensors: dict[str, th.Tensor], document: Any) -> None:
+    """An encoder file with a right digest, made without the code under test: search for a marker and replace it."""
+    marker = bytes(range(200, 232))
+    tensors["digest"] = th.tensor(list(marker), dtype=th.uint8)
+    data = safetensors.torch.save(
+        tensors, {"sb3_abisim": document if isinstance(document, str) else json.dumps(document)}
+    )
+    assert data.count(marker) == 1
+    hash = hashlib.sha256(data.replace(marker, bytes(32))).digest()
+    path.write_bytes(data.replace(marker, hash))
+
+
+def forge(path: Path, edit: Callable[[dict[str, th.Tensor], dict[str, Any]], object]) -> None:
+    """Change tensors and metadata of an encoder file, and set the digest right."""
+    data = path.read_bytes()
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    tensors, document = safetensors.torch.load(data), json.loads(header["__metadata__"]["sb3_abisim"])
+    edit(tensors, document)
+    write_with_digest(path, tensors, document)
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    encoder = seeded_encoder()
+    hash = save(tmp_path / "e.safetensors", encoder)
+    file = load_encoder(str(tmp_path / "e.safetensors"))
+    assert (file.path, file.hash) == (tmp_path / "e.safetensors", hash)
+    assert file.encoder.spec() == encoder.spec() and not file.encoder.training
+    for name, weight in encoder.state_dict().items():
+        assert th.equal(file.encoder.state_dict()[name], weight), name
+    versions = file.metadata.pop("versions")
+    assert versions["torch"] == th.__version__.split("+")[0] or versions["torch"] == th.__version__
+    assert file.metadata == {
+        "observation_space": {
+            "type": "Box",
+            "shape": [3, 15, 15],
+            "dtype": "uint8",
+            "low": 0,
+            "high": 255,
+            "channel_order": "CHW",
+        },
+        "action_space": {"type": "Box", "shape": [2], "dtype": "float32", "low": [-1, -2], "high": [3, 4]},
+        "env_id": "Nav2D-v0",
+        "env_kwargs": {"n_obstacles": 3},
+        "objective": "ssi",
+        "settings": {"beta": 0.5, "digest": "0" * 64},
+        "dataset_digest": DATASET_DIGEST,
+    }
+
+
+def test_golden_batch_is_what_the_network_makes_of_images_over_255(path: Path) -> None:
+    tensors = safetensors.torch.load_file(path)
+    assert np.array_equal(tensors["golden.observations"].numpy(), FRAMES)
+    with th.no_grad():
+        expected = seeded_encoder()(th.from_numpy(FRAMES).float() / 255)
+    assert th.allclose(tensors["golden.embeddings"], expected, rtol=0, atol=1e-6)
+
+
+def test_digest_is_sha256_with_its_own_bytes_blank(path: Path) -> None:
+    hash = load_encoder(path).hash
+    data = path.read_bytes()
+    assert data.count(bytes.fromhex(hash)) == 1
+    assert hashlib.sha256(data.replace(bytes.fromhex(hash), bytes(32))).hexdigest() == hash
+
+
+def test_same_arguments_same_bytes(tmp_path: Path) -> None:
+    for i in range(10):
+        save(tmp_path / f"{i}")
+    assert len({(tmp_path / f"{i}").read_bytes() for i in range(10)}) == 1
+    assert save(tmp_path / "other", seeded_encoder(1)) != save(tmp_path / "0")
+    assert save(tmp_path / "other", settings={"beta": 0.25}) != save(tmp_path / "0")
+
+
+def test_saving_and_loading_leave_encoder_and_random_state_alone(tmp_path: Path) -> None:
+    encoder = seeded_encoder().train()
+    before = th.get_rng_state()
+    save(tmp_path / "e", encoder)
+    load_encoder(tmp_path / "e")
+    assert encoder.training and th.equal(th.get_rng_state(), before)
+
+
+def test_no_flipped_bit_loads(path: Path) -> None:
+    good = path.read_bytes()
+    header_size = 8 + int.from_bytes(good[:8], "little")
+    rng = np.random.default_rng(1)
+    positions = [*range(0, header_size, 13), *rng.integers(0, len(good), 400).tolist(), len(good) - 1]
+    for position in positions:
+        bad = bytearray(good)
+        bad[position] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bad)
+        with pytest.raises(EncoderFileError) as raised:
+            load_encoder(path)
+        assert str(path) in str(raised.value) and "sb3_abisim.pretraining.pretrain" in str(raised.value)
+    path.write_bytes(good)
+    load_encoder(path)
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 8, 9, 100, 2000, -4000, -1])
+def test_truncated(path: Path, length: int) -> None:
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(EncoderFileError, match="again"):
+        load_encoder(path)
+
+
+def test_appended_bytes(path: Path) -> None:
+    path.write_bytes(path.read_bytes() + b"\0")
+    with pytest.raises(EncoderFileError, match="damaged"):
+        load_encoder(path)
+
+
+class Payload:
+    """Writes a file when unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self.marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.write_text, (self.marker, "executed"))
+
+
+def test_pickle_is_not_executed(tmp_path: Path) -> None:
+    marker = tmp_path / "marker"
+    (tmp_path / "e.safetensors").write_bytes(pickle.dumps(Payload(marker)))
+    with pytest.raises(EncoderFileError, match="pickle"):
+        load_encoder(tmp_path / "e.safetensors")
+    th.save(Payload(marker), tmp_path / "f.safetensors")
+    with pytest.raises(EncoderFileError, match="zip"):
+        load_encoder(tmp_path / "f.safetensors")
+    assert not marker.exists()
+
+
+def test_zip_and_other_safetensors(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "model.zip", "w") as archive:
+        archive.writestr("data", "{}")
+    with pytest.raises(EncoderFileError, match=r"model\.zip.*SB3 model"):
+        load_encoder(tmp_path / "model.zip")
+    safetensors.torch.save_file({"weight": th.ones(2)}, tmp_path / "plain")
+    with pytest.raises(EncoderFileError, match="not an encoder file"):
+        load_encoder(tmp_path / "plain")
+
+
+@pytest.mark.parametrize(
+    "header", [b"[]", b"{", b"\xff\xff", b"[" * 100_000, b"null", b'{"digest":{"dtype":"U8","data_offsets":[0,1e999]}}']
+)
+def test_malformed_header(tmp_path: Path, header: bytes) -> None:
+    (tmp_path / "e").write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(EncoderFileError, match="again"):
+        load_encoder(tmp_path / "e")
+
+
+def test_a_forged_but_harmless_file_loads(path: Path) -> None:
+    """The positive control of the tests below: forging itself breaks nothing."""
+    forge(path, lambda tensors, document: document["contract"].update(env_id="Other-v0"))
+    assert load_encoder(path).metadata["env_id"] == "Other-v0"
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        {"name": "system", "kwargs": {}},
+        {"name": "os.system", "kwargs": {"command": "true"}},
+        {"name": "__class__", "kwargs": {}},
+        {"name": None, "kwargs": {}},
+        {"name": ["Nav2DEncoder"], "kwargs": {}},
+        {"name": "Nav2DEncoder", "kwargs": {"unknown": 1}},
+        {"name": "Nav2DEncoder", "kwargs": {"name": "PointMazeEncoder"}},
+        {"name": "Nav2DEncoder", "kwargs": {"n_input_channels": "3"}},
+        {"name": "Nav2DEncoder", "kwargs": {"n_input_channels": -3}},
+        {"name": "Nav2DEncoder", "kwargs": {"n_input_channels": 10**13}},
+        {"name": "Nav2DEncoder", "kwargs": []},
+        {"name": "PointMazeEncoder", "kwargs": {}},
+        {"name": "PointMazeEncoder", "kwargs": {"features_dim": 10**13}},
+        {},
+        "Nav2DEncoder",
+    ],
+)
+def test_network_from_the_file_is_validated(path: Path, network: Any) -> None:
+    forge(path, lambda tensors, document: document.update(network=network))
+    with pytest.raises(EncoderFileError, match="not a valid encoder file"):
+        load_encoder(path)
+
+
+def test_vast_network_is_refused_before_memory_is_taken(path: Path) -> None:
+    def edit(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> None:
+        document["network"] = {"name": "PointMazeEncoder", "kwargs": {"features_dim": 10**10}}
+        document["contract"]["observation_space"]["shape"] = [3, 64, 64]
+        tensors["golden.observations"] = th.zeros(1, 3, 64, 64, dtype=th.uint8)
+
+    forge(path, edit)
+    with pytest.raises(EncoderFileError, match="do not fit the network"):
+        load_encoder(path)
+
+
+@pytest.mark.parametrize(
+    "document", ["[]", "{}", "nonsense", "[" * 100_000, '{"format": 1}', '{"format": 1, "contract": 3}']
+)
+def test_malformed_metadata(path: Path, document: str) -> None:
+    write_with_digest(path, safetensors.torch.load_file(path), document)
+    with pytest.raises(EncoderFileError, match="not a valid encoder file"):
+        load_encoder(path)
+
+
+def test_other_format_and_contract(path: Path) -> None:
+    forge(path, lambda tensors, document: document["contract"].pop("objective"))
+    with pytest.raises(EncoderFileError, match="contract has the keys"):
+        load_encoder(path)
+    forge(path, lambda tensors, document: document.update(format=2))
+    with pytest.raises(EncoderFileError, match=r"format 2.*newer"):
+        load_encoder(path)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("encoder.layers.0.bias", th.zeros(33)),
+        ("encoder.layers.0.bias", th.zeros(32, dtype=th.float64)),
+        ("encoder.extra", th.zeros(1)),
+        ("golden.observations", th.zeros(5, 3, 15, 15)),
+        ("golden.observations", th.zeros(5, 15, 15, 3, dtype=th.uint8)),
+    ],
+)
+def test_tensors_that_do_not_fit(path: Path, name: str, value: th.Tensor) -> None:
+    forge(path, lambda tensors, document: tensors.update({name: value}))
+    with pytest.raises(EncoderFileError, match="not a valid encoder file"):
+        load_encoder(path)
+
+
+def raw_embeddings(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> None:
+    """As if pretraining had not divided pictures by 255."""
+    with th.no_grad():
+        tensors["golden.embeddings"] = seeded_encoder()(tensors["golden.observations"].float())
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        raw_embeddings,
+        lambda tensors, document: tensors["golden.embeddings"].mul_(1.001),
+        lambda tensors, document: tensors["golden.embeddings"].fill_(th.nan),
+        lambda tensors, document: tensors["encoder.layers.0.weight"].mul_(1.01),
+        lambda tensors, document: tensors["golden.observations"].add_(1),
+    ],
+)
+def test_golden_batch_that_does_not_agree(path: Path, edit: Callable[..., object]) -> None:
+    forge(path, edit)
+    with pytest.raises(EncoderFileError, match="golden batch differently"):
+        load_encoder(path)
+
+
+def test_golden_batch_tolerates_rounding(path: Path) -> None:
+    forge(path, lambda tensors, document: tensors["golden.embeddings"].mul_(1 + checkpoint.REFERENCE_TOLERANCE / 2))
+    load_encoder(path)
+
+
+def test_save_refuses(tmp_path: Path) -> None:
+    broken = seeded_encoder()
+    with th.no_grad():
+        next(broken.parameters())[0] = th.nan
+    with pytest.raises(ValueError, match=r"not finite.*layers\.0\.weight"):
+        save(tmp_path / "e", broken)
+    with pytest.raises(ValueError, match="golden_observations must be uint8"):
+        save(tmp_path / "e", reference_observations=FRAMES / 255)
+    with pytest.raises(ValueError, match="golden_observations must be uint8"):
+        save(tmp_path / "e", reference_observations=FRAMES[:0])
+    with pytest.raises(ValueError, match="JSON"):
+        save(tmp_path / "e", settings={"path": Path("x")})
+    with pytest.raises(ValueError, match="JSON"):
+        save(tmp_path / "e", settings={"beta": float("nan")})
+    with pytest.raises(ValueError, match="uint8 images"):
+        save(tmp_path / "e", observation_space=spaces.Box(0, 1, (3, 15, 15)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_full_disk_keeps_the_old_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    old = path.read_bytes()
+
+    def fsync(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", fsync)
+    with pytest.raises(OSError, match="No space"):
+        save(path, seeded_encoder(7))
+    assert path.read_bytes() == old and list(path.parent.iterdir()) == [path]
+
+
+def test_check_prints_both_sides(path: Path) -> None:
+    file = load_encoder(path)
+    file.check(SPACE, ACTIONS)
+    file.check(SPACE)
+    with pytest.raises(ValueError, match=r"\[3, 15, 15\].*\[3, 16, 15\]"):
+        file.check(spaces.Box(0, 255, (3, 16, 15), np.uint8))
+    with pytest.raises(ValueError, match=r"'high': 255.*'high': 254"):
+        file.check(spaces.Box(0, 254, (3, 15, 15), np.uint8))
+    with pytest.raises(ValueError, match=r"action_space.*float32.*Discrete"):
+        file.check(SPACE, spaces.Discrete(4))

@@ -1,0 +1,294 @@
+"""Eqs. 6 to 8 against loop-written derivations, gradient routing, and the fixed point on a chain solved by hand."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_abisim.networks.base import Encoder
+from sb3_abisim.networks.heads import MLP
+from sb3_abisim.objectives.action_bisim import (
+    ActionBisimulation,
+    action_bisim_target,
+    same_action_pairs,
+    w1_gaussian,
+)
+from sb3_abisim.objectives.base import TensorBatch
+
+DISCRETE = gym.spaces.Discrete(2)
+CONTINUOUS = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+
+class LineEncoder(Encoder):
+    """Vectors instead of images, for speed."""
+
+    observation_shape = (1, 1, 4)
+
+    def __init__(self, features_dim: int = 3, hidden_dim: int = 8) -> None:
+        layers = nn.Sequential(nn.Flatten(), MLP(4, hidden_dim, features_dim))
+        super().__init__(layers, features_dim, {"features_dim": features_dim})
+
+
+def make(action_space=DISCRETE, **kwargs):
+    th.manual_seed(0)
+    return ActionBisimulation(LineEncoder(3), action_space, LineEncoder(5), **kwargs)
+
+
+def make_batch(action_space=DISCRETE, n=6):
+    generator = th.Generator().manual_seed(2)
+    actions = (
+        th.randint(0, 2, (n,), generator=generator)
+        if isinstance(action_space, gym.spaces.Discrete)
+        else 2 * th.rand(n, 2, generator=generator) - 1
+    )
+    return TensorBatch.of(th.rand(n, 1, 1, 4, generator=generator), actions, th.rand(n, 1, 1, 4, generator=generator))
+
+
+def l1(x, y):
+    return sum(abs(float(a) - float(b)) for a, b in zip(x, y, strict=True))
+
+
+def test_target_weights_its_two_terms():
+    assert float(action_bisim_target(th.tensor(3.0), th.tensor(5.0), 0.75)) == 0.25 * 3 + 0.75 * 5
+
+
+@th.no_grad()
+def test_behavior_loss_equals_loop():
+    objective, batch = make(expectation="behavior", distance_loss="mse", c=0.7, l1_penalty=0.2), make_batch()
+    phi = objective.encoder(batch.obs)
+    psi = objective.base_encoder(batch.obs)
+    phi_next = objective.target_encoder(batch.next_obs)
+    errors = []
+    for i in range(6):
+        for j in range(6):
+            if i != j and batch.actions[i] == batch.actions[j]:
+                target = 0.3 * l1(psi[i], psi[j]) + 0.7 * l1(phi_next[i], phi_next[j])
+                errors.append((l1(phi[i], phi[j]) - target) ** 2)
+    assert 0 < len(errors) < 30, "the batch must hold pairs of both kinds"
+    norm = sum(l1(phi[i], th.zeros(3)) for i in range(6)) / 6
+    assert float(objective.loss(batch)[0]) == pytest.approx(sum(errors) / len(errors) + 0.2 * norm, rel=1e-4)
+
+
+@pytest.mark.parametrize("wasserstein", ["means", "gaussian"])
+@th.no_grad()
+def test_uniform_loss_equals_loop(wasserstein):
+    objective, batch = make(c=0.7, wasserstein=wasserstein), make_batch()
+    phi = objective.encoder(batch.obs)
+    psi = objective.base_encoder(batch.obs)
+    phi_target = objective.target_encoder(batch.obs)
+    total = 0.0
+    for i in range(6):
+        for j in range(6):
+            if i == j:
+                continue
+            w1 = 0.0
+            for action in th.eye(2):
+                (mean_i, std_i), (mean_j, std_j) = (
+                    objective.forward_model(phi_target[k][None], action[None]) for k in (i, j)
+                )
+                if wasserstein == "means":
+                    w1 += l1(mean_i[0], mean_j[0]) / 2
+                else:
+                    w1 += float(w1_gaussian(mean_i, std_i, mean_j, std_j)) / 2
+            total += abs(l1(phi[i], phi[j]) - 0.3 * l1(psi[i], psi[j]) - 0.7 * w1)
+    assert float(objective.loss(batch)[1]["metric_loss"]) == pytest.approx(total / 30, rel=1e-4)
+
+
+@th.no_grad()
+def test_forward_nll_equals_loop():
+    objective, batch = make(), make_batch()
+    phi = objective.target_encoder(batch.obs)
+    phi_next = objective.target_encoder(batch.next_obs)
+    total = 0.0
+    for i in range(6):
+        action = [1.0 if k == int(batch.actions[i]) else 0.0 for k in range(2)]
+        mean, std = objective.forward_model(phi[i][None], th.tensor([action]))
+        for d in range(3):
+            residual = (float(phi_next[i, d]) - float(mean[0, d])) / float(std[0, d])
+            total += 0.5 * residual**2 + math.log(float(std[0, d])) + 0.5 * math.log(2 * math.pi)
+    assert float(objective.loss(batch)[1]["forward_nll"]) == pytest.approx(total / 18, rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_w1_gaussian_equals_numerical_transport(seed):
+    """In one dimension W1 is the area between quantile functions; dimensions add up."""
+    rng = np.random.default_rng(seed)
+    mean_i, mean_j = rng.normal(size=(2, 3))
+    std_i, std_j = rng.uniform(0.1, 2.0, size=(2, 3))
+    std_j[0] = std_i[0]
+    levels = th.linspace(0, 1, 200_001, dtype=th.float64)[1:-1]
+    z = th.special.ndtri(levels).numpy()
+    expected = sum(np.abs(mean_i[d] + std_i[d] * z - mean_j[d] - std_j[d] * z).mean() for d in range(3))
+    actual = w1_gaussian(*(th.as_tensor(x, dtype=th.float32) for x in (mean_i, std_i, mean_j, std_j)))
+    assert float(actual) == pytest.approx(expected, rel=1e-3)
+
+
+def test_pairs_are_different_transitions_with_the_same_action():
+    objective, actions = make(expectation="behavior", n_pairs=5), th.tensor([0, 1, 0, 1, 1, 0, 0])
+    seen = set()
+    for _ in range(50):
+        i, j = objective._sample_pairs(actions, th.rand(len(actions), 5))
+        assert len(i) == 5 and bool((actions[i] == actions[j]).all())
+        drawn = {frozenset(pair) for pair in zip(i.tolist(), j.tolist(), strict=True)}
+        assert len(drawn) == 5 and all(len(pair) == 2 for pair in drawn)
+        seen |= drawn
+    assert len(seen) == 6 + 3, "every pair with equal actions gets its turn"
+    with pytest.raises(ValueError, match="same action"):
+        objective._sample_pairs(th.tensor([0, 1]), th.rand(2, 5))
+
+
+@th.no_grad()
+def test_near_pairs_loss_equals_loop():
+    # 12 states, 10 pairs: the 5 nearest in the base, and 5 at random, which this test reads from the generator.
+    objective = make(expectation="behavior", distance_loss="l1", c=0.7, pairs="nearest", n_pairs=10)
+    batch = make_batch(n=12)
+    psi = objective.base_encoder(batch.obs)
+    phi, phi_next = objective.encoder(batch.obs), objective.target_encoder(batch.next_obs)
+    same = [(i, j) for i in range(12) for j in range(i + 1, 12) if batch.actions[i] == batch.actions[j]]
+    assert len(same) > 20
+    th.manual_seed(5)
+    chosen = sorted(same, key=lambda pair: l1(psi[pair[0]], psi[pair[1]]))[:5]
+    chosen += [same[k] for k in th.randperm(len(same))[:5].tolist()]
+    mean = sum(l1(psi[i], psi[j]) for i, j in chosen) / 10
+    errors = []
+    for i, j in chosen:
+        base = l1(psi[i], psi[j])
+        target = 0.3 * base + 0.7 * l1(phi_next[i], phi_next[j])
+        errors.append(mean / (base + 0.05 * mean) * abs(l1(phi[i], phi[j]) - target))
+    th.manual_seed(5)
+    assert float(objective.loss(batch)[0]) == pytest.approx(sum(errors) / 10, rel=1e-4)
+
+
+@th.no_grad()
+def test_near_pairs_of_a_collapsed_base_are_finite():
+    objective = make(pairs="nearest")
+    for parameter in objective.base_encoder.parameters():
+        parameter.zero_()
+    assert th.isfinite(objective.loss(make_batch())[0])
+
+
+def test_same_action_pairs_of_continuous_actions():
+    actions = th.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 0.5]])
+    expected = [[True, True, False], [True, True, False], [False, False, True]]
+    assert same_action_pairs(actions, 0.2).tolist() == expected
+
+
+@pytest.mark.parametrize("expectation", ["uniform", "behavior"])
+@pytest.mark.parametrize("space", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_gradients_move_encoder_and_forward_model_only(expectation, space):
+    objective = make(space, expectation=expectation, action_radius=1.0)
+    objective.loss(make_batch(space))[0].backward()
+    moved = {name.split(".")[0] for name, p in objective.named_parameters() if p.grad is not None}
+    assert moved == {"encoder"} | ({"forward_model"} if expectation == "uniform" else set())
+    assert all(not p.requires_grad for p in objective.base_encoder.parameters())
+    assert all(not p.requires_grad for p in objective.target_encoder.parameters())
+
+
+def test_metric_loss_gives_the_forward_model_no_gradient():
+    """It would otherwise learn to make distances match instead of to predict."""
+    objective, batch = make(), make_batch()
+    objective.loss(batch)[0].backward()
+    with_metric = [p.grad.clone() for p in objective.forward_model.parameters()]
+    objective.zero_grad()
+    phi, phi_next = objective.target_encoder(batch.obs), objective.target_encoder(batch.next_obs)
+    objective.forward_model.nll(phi, objective.action_inputs(batch.actions), phi_next).backward()
+    alone = [p.grad for p in objective.forward_model.parameters()]
+    assert all(th.allclose(a, b) for a, b in zip(with_metric, alone, strict=True))
+
+
+def test_target_encoder_is_a_moving_average():
+    objective = make(tau=0.1)
+    before = [p.clone() for p in objective.target_encoder.parameters()]
+    with th.no_grad():
+        for p in objective.encoder.parameters():
+            p.add_(1.0)
+    objective.after_step()
+    for old, new in zip(before, objective.target_encoder.parameters(), strict=True):
+        assert th.allclose(new, old + 0.1)
+
+
+def test_forward_model_reset():
+    objective = make(forward_reset_interval=2)
+    weights = [objective.forward_model.network[0].weight.clone()]
+    for _ in range(2):
+        objective.after_step()
+        weights.append(objective.forward_model.network[0].weight.clone())
+    assert th.equal(weights[0], weights[1])
+    assert not th.equal(weights[1], weights[2])
+
+
+def test_warm_start_copies_the_base():
+    th.manual_seed(0)
+    base = LineEncoder(3)
+    objective = ActionBisimulation(LineEncoder(3), DISCRETE, base, warm_start=True)
+    for copied in (objective.encoder, objective.target_encoder):
+        assert all(th.equal(a, b) for a, b in zip(copied.parameters(), base.parameters(), strict=True))
+    with pytest.raises(ValueError, match="warm_start"):
+        make(warm_start=True)
+
+
+def chain():
+    """Three states in a row; action 0 goes to the first, action 1 one to the right. psi sets the first apart by 1."""
+    observations = th.zeros(3, 1, 1, 4)
+    observations[range(3), 0, 0, range(3)] = 1.0
+    following = {0: (0, 1), 1: (0, 2), 2: (0, 2)}
+    s = [i for i in following for _ in range(2)] * 6
+    actions = [0, 1] * 18
+    s_next = [following[i][a] for i, a in zip(s, actions, strict=True)]
+    batch = TensorBatch.of(observations[s], th.tensor(actions), observations[s_next])
+    base = LineEncoder(1)
+    base.layers = nn.Sequential(nn.Flatten(), nn.Linear(4, 1, bias=False))
+    with th.no_grad():
+        # Encoders map 0..1 to -1..1, so half a weight makes psi differ by 1.
+        base.layers[1].weight.copy_(th.tensor([[0.5, 0.0, 0.0, 0.0]]))
+    return observations, batch, base
+
+
+@pytest.mark.parametrize("expectation", ["uniform", "behavior"])
+def test_converges_to_the_metric_of_a_chain(expectation):
+    """By hand, with c = 1/2, p = d(0,1), q = d(0,2), r = d(1,2).
+
+    Action 0 leads both states of a pair to state 0, at distance 0. Action 1 leads (0,1) to (1,2), (0,2) to (1,2) and
+    (1,2) to (2,2). So r = 0, p = q = 1/2 * 1 + 1/2 * (0 + r)/2 = 1/2.
+    """
+    observations, batch, base = chain()
+    th.manual_seed(0)
+    objective = ActionBisimulation(
+        LineEncoder(4, 32), DISCRETE, base, c=0.5, tau=0.05, expectation=expectation, distance_loss="mse"
+    )
+    optimizer = th.optim.Adam([p for p in objective.parameters() if p.requires_grad], lr=3e-3)
+    for _ in range(1500):
+        loss, _ = objective.loss(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        objective.after_step()
+    distances = th.cdist(*(objective.encoder(observations),) * 2, p=1)
+    expected = th.tensor([[0.0, 0.5, 0.5], [0.5, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    assert th.allclose(distances, expected, atol=0.04), distances
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"c": 1.0}, "c must lie"),
+        ({"n_pairs": 0}, "n_pairs"),
+        ({"n_pairs": 8.0}, "n_pairs must be a whole number of at least 1, got 8.0"),
+        ({"l1_penalty": math.nan}, "l1_penalty"),
+        ({"c": -0.1}, "c must lie"),
+        ({"tau": 0.0}, "tau"),
+        ({"expectation": "both"}, "both"),
+        ({"distance_loss": "l3"}, "l3"),
+        ({"wasserstein": "w2"}, "w2"),
+        ({"pairs": "far"}, "far"),
+        ({"expectation": "behavior", "wasserstein": "gaussian"}, "forward model"),
+        ({"forward_reset_interval": 0}, "forward_reset_interval"),
+    ],
+    ids=str,
+)
+def test_refuses_bad_settings(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make(**kwargs)

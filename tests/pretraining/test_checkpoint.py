@@ -1,0 +1,185 @@
+"""Interruption changes nothing, and what belongs to another run is refused."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from pretrain_inputs import SETTINGS, collect_grids, run
+
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.pretraining.config import load_config
+from sb3_abisim.pretraining.pretrain import pretrain
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    return collect_grids(tmp_path_factory)
+
+
+class Interrupted(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("objective", "stop_at", "chunk_length"),
+    [
+        ("ssi", 3, 1),
+        ("ssi", 29, 1),
+        ("ssi", 12, 8),
+        ("acro", 12, 1),
+        ("beta_vae", 12, 1),
+        ("curl", 12, 1),
+        ("info_nce", 12, 4),
+        ("abisim", 12, 1),
+    ],
+)
+def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, objective, stop_at, chunk_length):
+    kwargs = {}
+    base = str(run(data, tmp_path / "base.safetensors"))
+    config = load_config(objective, "Nav2D-v0", {**SETTINGS, "chunk_length": chunk_length})
+    if objective == "abisim":
+        kwargs["base"] = base
+    # Different folders, equal names: what is compared must not hold the path.
+    outputs = [tmp_path / name / "encoder.safetensors" for name in ("whole", "stopped")]
+    pretrain(objective, data, outputs[0], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
+    from sb3_abisim.pretraining.trainer import PretrainRun
+
+    update, count = PretrainRun._update, 0
+
+    def interrupt(self, batch):
+        nonlocal count
+        count += 1
+        if count == stop_at:
+            raise Interrupted
+        return update(self, batch)
+
+    monkeypatch.setattr(PretrainRun, "_update", interrupt)
+    with pytest.raises(Interrupted):
+        pretrain(objective, data, outputs[1], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
+    assert not outputs[1].exists()
+    pretrain(objective, data, outputs[1], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
+    # Went on from the checkpoint at the last multiple of 5 before the stop.
+    assert count == stop_at + 30 - (stop_at - 1) // 5 * 5
+    for suffix in (".safetensors", ".json"):
+        assert outputs[0].with_suffix(suffix).read_bytes() == outputs[1].with_suffix(suffix).read_bytes()
+    rows = [sorted(p.with_suffix(".run").joinpath("progress.csv").read_text().splitlines()) for p in outputs]
+    assert len(rows[0]) == len(rows[1]) == 7
+
+
+def test_killed_command_goes_on_to_the_same_bytes(data, tmp_path):
+    def command(folder):
+        words = [f"{k}:{v}" for k, v in {**SETTINGS, "n_updates": 60}.items()]
+        return [
+            sys.executable,
+            "-m",
+            "sb3_abisim",
+            "pretrain",
+            "--objective",
+            "ssi",
+            "--env",
+            "Nav2D-v0",
+            "--data",
+            str(data),
+            "-o",
+            str(folder / "ssi.safetensors"),
+            "--device",
+            "cpu",
+            "--verbose",
+            "0",
+            "-params",
+            *words,
+        ]
+
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run(command(tmp_path / "whole"), check=True, env=environment, capture_output=True)
+    process = subprocess.Popen(command(tmp_path / "killed"), env=environment, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("killed/ssi.run/checkpoint-*")):
+        assert process.poll() is None and time.monotonic() < deadline, "the run must reach its first checkpoint"
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    subprocess.run(command(tmp_path / "killed"), check=True, env=environment, capture_output=True)
+    for name in ("ssi.safetensors", "ssi.json"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes()
+
+
+def test_finished_run_is_left_alone_and_other_settings_are_refused(data, tmp_path):
+    output = run(data, tmp_path / "ssi.safetensors")
+    before = output.stat().st_mtime_ns
+    run(data, output)
+    assert output.stat().st_mtime_ns == before
+    with pytest.raises(ValueError, match=r"n_updates: 30 there, 40 here"):
+        run(data, output, n_updates=40)
+    content = output.read_bytes()
+    output.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    with pytest.raises(ValueError, match=r"ssi\.safetensors .*To have it written again, remove it first"):
+        run(data, output)
+    output.unlink()
+    assert run(data, output).read_bytes() == content
+
+
+def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):
+    from sb3_abisim.pretraining.trainer import PretrainRun
+
+    monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
+    run(data, tmp_path / "ssi.safetensors")
+    with pytest.raises(ValueError, match="other settings"):
+        run(data, tmp_path / "ssi.safetensors", learning_rate=0.5)
+
+
+def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
+    from sb3_abisim.pretraining.trainer import PretrainRun
+
+    monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
+    run(data, tmp_path / "ssi.safetensors")
+    path = sorted((tmp_path / "ssi.run").glob("checkpoint-*"))[-1]
+    content = bytearray(path.read_bytes())
+    for position in (3, len(content) // 2, len(content) - 1):
+        damaged = bytearray(content)
+        damaged[position] ^= 1
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="damaged"):
+            run(data, tmp_path / "ssi.safetensors")
+
+
+@pytest.mark.parametrize(("log_interval", "n_rows", "saved"), [(7, 5, [14, 28]), (30, 1, [30]), (100, 1, [30])])
+def test_checkpoints_and_rows_come_whatever_the_intervals(data, tmp_path, monkeypatch, log_interval, n_rows, saved):
+    """At the first row after each interval; the last row is at the end."""
+    from sb3_abisim.pretraining.trainer import PretrainRun
+
+    positions, plain = [], PretrainRun.save
+    monkeypatch.setattr(PretrainRun, "save", lambda run: positions.append(run.n_updates) or plain(run))
+    fixed = {"objective_kwargs.adaptive": None, "objective_kwargs.l1_penalty": 0.25}
+    run(data, tmp_path / "e.safetensors", log_interval=log_interval, checkpoint_interval=10, **fixed)
+    rows = json.loads((tmp_path / "e.json").read_text())["curves"]
+    assert positions == saved and len(rows["n_updates"]) == n_rows and rows["n_updates"][-1] == 30
+    assert rows["train/beta"] == [0.25] * n_rows, "means over the updates of a row"
+
+
+def test_keeps_the_last_two_checkpoints(data, tmp_path, monkeypatch):
+    from sb3_abisim.pretraining.trainer import PretrainRun
+
+    monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
+    run(data, tmp_path / "ssi.safetensors")
+    names = [path.name for path in sorted((tmp_path / "ssi.run").glob("checkpoint-*"))]
+    assert names == ["checkpoint-000000025.safetensors", "checkpoint-000000030.safetensors"]
+
+
+def test_second_writer_is_refused(data, tmp_path):
+    from sb3_abisim.common.files import folder_lock
+
+    (tmp_path / "ssi.run").mkdir()
+    with folder_lock(tmp_path / "ssi.run"), pytest.raises(ValueError, match=str(os.getpid())):
+        run(data, tmp_path / "ssi.safetensors")
+
+
+def test_files_from_before_runs_of_transitions_existed_stay_those_of_the_same_run(data, tmp_path):
+    output = run(data, tmp_path / "ssi.safetensors")
+    assert "chunk_length" not in load_encoder(str(output)).metadata["settings"]
+    with pytest.raises(ValueError, match="chunk_length: None there, 8 here"):
+        run(data, output, chunk_length=8)

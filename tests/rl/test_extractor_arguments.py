@@ -1,0 +1,115 @@
+"""What the extractors refuse, and how they say it."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import stable_baselines3 as sb3
+from extractor_inputs import FRAMES, SPACE, BatchNormEncoder, Pictures, build, write
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import sb3_abisim
+from sb3_abisim.networks import base as networks
+from sb3_abisim.objectives import OBJECTIVES
+from sb3_abisim.pretraining.pretrain import OBJECTIVE_NAMES
+from sb3_abisim.rl.extractors import ActionBisimExtractor, PretrainedExtractor, VanillaExtractor
+from sb3_abisim.zoo import manager as zoo
+
+
+@pytest.fixture(autouse=True)
+def batch_norm_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(networks.ENCODERS, "BatchNormEncoder", BatchNormEncoder)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return write(tmp_path / "e.safetensors")
+
+
+@pytest.fixture
+def batch_norm_path(tmp_path: Path) -> Path:
+    return write(tmp_path / "bn.safetensors", "BatchNormEncoder")
+
+
+EXTRACTORS = {cls.objective: cls for cls in PretrainedExtractor.__subclasses__()}
+
+
+def test_every_objective_has_an_extractor() -> None:
+    assert set(EXTRACTORS) == set(OBJECTIVES) == set(OBJECTIVE_NAMES)
+    assert {cls.__name__ for cls in EXTRACTORS.values()} | {"VanillaExtractor"} == set(zoo.EXTRACTORS.values())
+    assert all(getattr(sb3_abisim, name) for name in zoo.EXTRACTORS.values())
+
+
+@pytest.mark.parametrize("objective", EXTRACTORS)
+def test_wrong_class_for_the_file(tmp_path: Path, objective: str) -> None:
+    file = str(write(tmp_path / objective, objective=objective))
+    right = EXTRACTORS[objective]
+    assert right(SPACE, file).metadata["objective"] == objective  # type: ignore[index]
+    for wrong in set(EXTRACTORS.values()) - {right}:
+        text = f"{objective} was trained by '{objective}', not '{wrong.objective}'; use {right.__name__}"
+        with pytest.raises(ValueError, match=text):
+            wrong(SPACE, file)
+
+
+def test_file_of_an_unknown_objective(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"trained by 'other'.*known objectives are \['abisim', 'acro'.*'ssi'\]"):
+        ActionBisimExtractor(SPACE, str(write(tmp_path / "other", objective="other")))
+
+
+def test_network_must_be_named_as_the_error_says(batch_norm_path: Path, tmp_path: Path) -> None:
+    wide = str(write(tmp_path / "wide", "BatchNormEncoder", width=5))
+    remedy = {"network": "BatchNormEncoder", "network_kwargs": {"width": 5}}
+    text = r"network='BatchNormEncoder', network_kwargs=\{'width': 5\}"
+    with pytest.raises(ValueError, match=rf"Nav2DEncoder.*{text}"):
+        ActionBisimExtractor(SPACE, wide)
+    with pytest.raises(ValueError, match=rf"'width': 4.*{text}"):
+        ActionBisimExtractor(SPACE, wide, network="BatchNormEncoder")
+    with pytest.raises(ValueError, match=rf"unknown encoder network 'Nonsense'.*{text}"):
+        ActionBisimExtractor(SPACE, wide, network="Nonsense")
+    assert ActionBisimExtractor(SPACE, wide, **remedy).features_dim == 6  # type: ignore[arg-type]
+    # The same is required where the file is absent, so that a mistake is not found out on another machine.
+    assert ActionBisimExtractor(SPACE, "absent", **remedy).n_parameters == 3 * 9 * 5 + 5 + 10 + 125 * 6 + 6  # type: ignore[arg-type]
+
+
+def test_arguments_are_not_changed(path: Path) -> None:
+    kwargs = build("SAC", path, True, network_kwargs={"n_input_channels": 3}).policy_kwargs["features_extractor_kwargs"]
+    assert kwargs == {"encoder": str(path), "freeze": True, "network_kwargs": {"n_input_channels": 3}}
+
+
+def test_damaged_file(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1] + b"\0\0")
+    with pytest.raises(ValueError, match=f"{path}.*damaged"):
+        build("PPO", path, True)
+
+
+@pytest.mark.parametrize("extractor_class", [ActionBisimExtractor, VanillaExtractor])
+@pytest.mark.parametrize(
+    "space, match",
+    [
+        (spaces.Box(0, 1, (3, 15, 15), np.float32), "uint8 images in 0..255, got Box.*float32"),
+        (spaces.Box(0, 255, (3, 15, 15), np.float32), "uint8 images"),
+        (spaces.Box(0, 1, (3, 15, 15), np.uint8), "uint8 images"),
+        (spaces.Box(0, 255, (675,), np.uint8), "uint8 images"),
+        (spaces.Discrete(3), "uint8 images"),
+        (spaces.Dict({"image": SPACE}), "MultiInputPolicy"),
+        (spaces.Box(0, 255, (12, 15, 15), np.uint8), "12, 15, 15"),
+    ],
+)
+def test_observation_space(path: Path, extractor_class: Any, space: gym.Space[Any], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        extractor_class(space, **({} if extractor_class is VanillaExtractor else {"encoder": str(path)}))
+
+
+def test_normalized_images_are_refused(path: Path) -> None:
+    policy_kwargs = build("PPO", path, True).policy_kwargs
+    vec_env = VecNormalize(DummyVecEnv([Pictures]))
+    with pytest.raises(ValueError, match="norm_obs=False"):
+        sb3.PPO("CnnPolicy", vec_env, policy_kwargs={**policy_kwargs, "normalize_images": False})
+    model = sb3.PPO("CnnPolicy", Pictures(), policy_kwargs={**policy_kwargs, "normalize_images": False}, device="cpu")
+    black = np.zeros_like(FRAMES)
+    model.predict(black)
+    with pytest.raises(ValueError, match=r"reach 255.*remove normalize_images=False"):
+        model.predict(FRAMES)

@@ -1,0 +1,171 @@
+"""Films of zoo runs."""
+
+import contextlib
+import dataclasses
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from PIL import Image
+from stable_baselines3 import PPO
+from zoo_inputs import SMALL
+
+from sb3_abisim.benchmark.command import main as benchmark
+from sb3_abisim.benchmark.export import export
+from sb3_abisim.zoo import manager as zoo
+from sb3_abisim.zoo import record as film_module
+from sb3_abisim.zoo.evaluate import final_model
+from sb3_abisim.zoo.record import MILLISECONDS, N_LAST, film, main
+from sb3_abisim.zoo.runs import find_runs, read_run
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in an environment with a short time limit, in which the agent waits at a corner for its end."""
+    logs = tmp_path_factory.mktemp("logs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", [])
+        words = ["--algo", "ppo", "--env", "Nav2D-v0", "-f", str(logs), "--conf-file", "vanilla", "-n", "100"]
+        words += ["--env-kwargs", "max_episode_steps:9", "--eval-freq", "-1", "--num-threads", "1"]
+        zoo.main(["train", *words, "-params", *SMALL["ppo"]])
+    return logs / "ppo" / "Nav2D-v0_1"
+
+
+def pictures(path: Path) -> list[tuple[int, np.ndarray]]:
+    """Milliseconds and content of each picture that differs from the one before."""
+    with Image.open(path) as gif:
+        shown = []
+        for i in range(gif.n_frames):
+            gif.seek(i)
+            shown.append((gif.info["duration"], np.asarray(gif.convert("RGB"))))
+        return shown
+
+
+def test_every_step_is_shown_and_each_end_stays_for_a_second(run_folder, tmp_path, monkeypatch):
+    # Right and left in turns: no two neighboring pictures are alike, unless the agent stands between walls.
+    turns = iter([2, 3] * 100)
+    monkeypatch.setattr(PPO, "predict", lambda *args, **kwargs: (np.int64(next(turns)), None))
+    success = film(run_folder, tmp_path / "a.gif", n_episodes=2, seed=3)
+    shown = pictures(tmp_path / "a.gif")
+    assert success in (0.0, 0.5, 1.0)
+    # Ten pictures for nine steps, with the run's own time limit; the last one stays.
+    assert sum(duration for duration, _ in shown) == 2 * (10 + N_LAST - 1) * MILLISECONDS
+    assert sum(duration >= N_LAST * MILLISECONDS for duration, _ in shown) == 2
+
+
+def test_of_a_long_episode_some_pictures_are_left_out(run_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(film_module, "MAX_PICTURES", 4)
+    film(run_folder, tmp_path / "a.gif", n_episodes=1)
+    # Every third of ten, the last among them.
+    assert sum(duration for duration, _ in pictures(tmp_path / "a.gif")) == (4 + N_LAST - 1) * MILLISECONDS
+
+
+def test_an_environment_that_knows_no_success(run_folder, tmp_path, monkeypatch):
+    class Silent(gym.Wrapper):
+        def step(self, action):
+            return (*super().step(action)[:4], {})
+
+    plain = gym.make
+    monkeypatch.setattr(gym, "make", lambda *args, **kwargs: Silent(plain(*args, **kwargs)))
+    assert film(run_folder, tmp_path / "a.gif", n_episodes=1) == 0.0
+    assert (tmp_path / "a.gif").is_file()
+
+
+def test_the_same_seed_films_the_same(run_folder, tmp_path):
+    for name in "ab":
+        film(run_folder, tmp_path / name, n_episodes=1, seed=5)
+    film(run_folder, tmp_path / "c", n_episodes=1, seed=6)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() != (tmp_path / "c").read_bytes()
+
+
+def test_the_seed_is_that_of_the_actions_too(run_folder, tmp_path, monkeypatch):
+    drawn = {}
+    for seed in (5, 6):
+        numbers = drawn[seed] = []
+        monkeypatch.setattr(
+            PPO, "predict", lambda *a, numbers=numbers, **k: (numbers.append(float(th.rand(()))) or np.int64(0), None)
+        )
+        film(run_folder, tmp_path / "a.gif", n_episodes=1, seed=seed)
+    assert drawn[5][0] != drawn[6][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere is no run folder of rl-zoo3"),
+        (["RUN", "--episodes", "0"], "n_episodes must be at least 1, got 0"),
+        (["RUN", "--gym-packages", "no_such_module"], "--gym-packages: cannot import 'no_such_module'"),
+    ],
+)
+def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message):
+    words = [str(run_folder) if word == "RUN" else word for word in arguments]
+    with pytest.raises(SystemExit):
+        main([*words, "-o", str(tmp_path / "a.gif")])
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "a.gif").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"env_wrapper": "some.Wrapper"}, "env_wrapper"),
+        ({"frame_stack": 2}, "frame_stack"),
+        ({"normalize": True}, "normalize"),
+        ({"normalize": "dict(norm_reward=True)"}, "normalize"),
+        ({"vec_env_wrapper": [{"some.VecWrapper": {"n": 1}}]}, "some.VecWrapper"),
+        ({"normalize": "dict(norm_obs=False, norm_reward=True)"}, None),
+        ({"normalize": "{'norm_obs': False}"}, None),
+        ({"normalize": {"norm_obs": False}}, None),
+        ({"normalize": "False"}, None),
+        ({"vec_env_wrapper": [{"sb3_abisim.rl.vec_encode.VecEncodeObservations": {"encoder": "e"}}]}, None),
+    ],
+)
+def test_wrappers_that_would_be_missing_are_named(run_folder, settings, named):
+    """A model would be shown other pictures, or act otherwise, than in training."""
+    run = dataclasses.replace(read_run(run_folder), settings=settings)
+    with contextlib.nullcontext() if named is None else pytest.raises(ValueError, match=f"with {named}, which is not"):
+        final_model(run)
+
+
+def test_a_run_that_goes_on_is_refused(run_folder, tmp_path):
+    model = run_folder / "Nav2D-v0.zip"
+    hidden = model.rename(tmp_path / "hidden.zip")
+    try:
+        with pytest.raises(ValueError, match=r"holds no final model \(Nav2D-v0.zip\); let the run end first"):
+            film(run_folder, tmp_path / "a.gif")
+    finally:
+        hidden.rename(model)
+
+
+def test_a_folder_that_is_not_there_is_told_before_filming(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main([str(tmp_path / "run"), "-o", str(tmp_path / "absent" / "a.gif")])
+    assert stopped.value.code == 2 and "there is no folder" in capsys.readouterr().err
+
+
+def test_an_environment_in_a_namespace(tmp_path, monkeypatch, capsys):
+    """The zoo turns the slash of its id into a dash wherever it names files."""
+    gym.register("toy/Grid-v0", entry_point=gym.spec("Nav2D-v0").entry_point, max_episode_steps=9)
+    try:
+        settings = "policy: CnnPolicy, n_timesteps: 64, n_envs: 2, n_steps: 32, batch_size: 32"
+        extractor = "dict(features_extractor_class=get_class_by_name('sb3_abisim.rl.extractors.VanillaExtractor'))"
+        (tmp_path / "own.yml").write_text(f'toy/Grid-v0: {{{settings}, policy_kwargs: "{extractor}"}}')
+        words = ["--algo", "ppo", "--env", "toy/Grid-v0", "-f", str(tmp_path / "logs"), "--eval-freq", "-1"]
+        monkeypatch.setattr("sys.argv", [])
+        zoo.main(["train", *words, "--conf-file", str(tmp_path / "own.yml"), "--num-threads", "1"])
+        run = tmp_path / "logs" / "ppo" / "toy-Grid-v0_1"
+        assert (read_run(run).env_id, read_run(run).env_name) == ("toy/Grid-v0", "toy-Grid-v0")
+        film(run, tmp_path / "a.gif", n_episodes=1)
+        benchmark(["evaluate", str(run), "--episodes", "2", "--gym-packages", "sb3_abisim"])
+        (copied,) = find_runs(export(tmp_path / "logs", tmp_path / "copy"))
+        assert copied.final()["stochastic/standard/results"].shape == (2,) and copied.command
+    finally:
+        del gym.registry["toy/Grid-v0"]
+    with pytest.raises(SystemExit):
+        benchmark(["evaluate", str(run)])
+    message = (
+        "was trained in toy/Grid-v0, which is not registered here; give the module that registers it with --gym-pack"
+    )
+    assert message in capsys.readouterr().err
