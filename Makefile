@@ -52,16 +52,16 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_scan
 	$(BIN)/python -m benchmarks.bench_allocator
 
-figures: setup  ## draw every figure of docs/figures.md anew from the committed encoders; about a quarter of an hour
+figures: setup  ## make every figure of docs/figures.md again from the committed encoders; about a quarter of an hour
 	$(BIN)/sb3-abisim analyze all --images docs/images --numbers benchmarks/results
 
-# The folders of committed runs whose curves stand in docs/results.md: of evaluations, and of training episodes.
+# The folders of committed runs whose curves are in docs/results.md: of evaluations, and of training episodes.
 COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
 TRAINING_COMPARISONS := distractor_frozen_longer distractor_frozen_early distractor_frozen_7m distractor_finetuned_more
-# Stands beside the runs of nav2d_dqn_target.
+# Compared with the runs of nav2d_dqn_target.
 NAV2D_VANILLA := vanilla, 10,000=benchmarks/results/comparison/nav2d_dqn/runs/Nav2D-v0/vanilla-cd2b7a74
 
-comparisons: setup  ## draw every curve of docs/results.md anew from the committed runs; a minute
+comparisons: setup  ## plot every curve of docs/results.md again from the committed runs; a minute
 	@draw() { \
 		name=$$1; shift; \
 		$(BIN)/sb3-abisim benchmark report benchmarks/results/comparison/$$name "$$@" -o build/comparisons/$$name && \
@@ -75,14 +75,14 @@ comparisons: setup  ## draw every curve of docs/results.md anew from the committ
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
 	$(BIN)/sb3-abisim benchmark -o benchmark
 
-# Budgets that show that the machinery works, and nothing about the methods. Of each thing the least that gives every part
+# Budgets that show that everything works, and nothing about the methods. Of each thing the least that gives every part
 # of the report: two runs for intervals, one encoder for both (on the SSI encoder that it starts from), a baseline, clips.
 SMOKE := --env Nav2D-v0 DistractorPointMaze-v0 --methods abisim vanilla --seeds 0 1 --encoder-seeds 0 \
 	--n-transitions 2000 -n 1024 --eval-freq 256 --eval-episodes 3 --n-eval-envs 3 --final-episodes 4 --device cpu \
 	--pretrain-params n_updates:20 log_interval:10 checkpoint_interval:10 batch_size:64 \
 	--params dqn.learning_starts:100 ppo.n_envs:4 ppo.n_steps:64 ppo.batch_size:64 ppo.n_epochs:2
 
-benchmark-smoke: setup  ## the same graph and report with tiny budgets, in minutes, into benchmark-smoke/
+benchmark-smoke: setup  ## the same kinds of jobs and report with tiny budgets, in minutes, into benchmark-smoke/
 	$(BIN)/sb3-abisim benchmark -o benchmark-smoke $(SMOKE)
 
 clean:  ## remove the environment and caches

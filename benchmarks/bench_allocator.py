@@ -1,7 +1,7 @@
-"""Speed of PPO through pictures with and without ``sb3_abisim.common.malloc.keep_freed_memory``.
+"""Speed of PPO on image observations with and without ``sb3_abisim.common.malloc.keep_freed_memory``.
 
 An untrained network with the hyperparameters of ``hyperparams/`` (on Distractor PointMaze with shorter rollouts). The
-two settings run in turns, each turn in a process of its own, since the allocator's setting holds for a process. Steps
+two settings run in turns, each turn in a new process, since the allocator's setting holds for a process. Speed is steps
 per second of processor time on one thread; the speed of each is that of its fastest turn. Linux with glibc.
 ``make bench``.
 """
@@ -72,8 +72,8 @@ def main(argv: list[str] | None = None) -> None:
         rows.append(f"| {env_id} | {speeds} | {plain['memory']:.2f} | {kept['memory']:.2f} |")
         print(rows[-1], flush=True)
     text = (
-        f"`python -m benchmarks.bench_allocator` on {machine()}: PPO through pictures, steps per second of processor "
-        f"time, fastest of {args.rounds} turns, and the most memory that was resident, in GB."
+        f"`python -m benchmarks.bench_allocator` on {machine()}: PPO on image observations, steps per second of "
+        f"processor time, fastest of {args.rounds} turns, and the most memory that was resident, in GB."
     )
     header = [
         "| environment | glibc's default | `keep_freed_memory` | ratio | memory, default | memory, kept |",

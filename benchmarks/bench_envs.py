@@ -1,7 +1,7 @@
 """Speed of the environments beside the alternatives, measured in turns within one run: ``make bench``.
 
-The alternatives are gymnasium-robotics' PointMaze rendered by MuJoCo at 64 x 64 (its own step of 0.01 s, where ours
-is 30 of them), and Nav2D written the plain way: one environment, one cell at a time. Every contender takes random
+The alternatives are gymnasium-robotics' PointMaze rendered by MuJoCo at 64 x 64 (its step is 0.01 s, ours is 30 of
+these), and Nav2D written the plain way: one environment, one cell at a time. Every contender takes random
 actions and starts its episodes anew where they end, all on one core. The speed of each is that of its fastest turn,
 the one least disturbed by other load on the machine. MuJoCo's renderer needs ``apt-get install libegl1 libgl1``.
 """

@@ -1,10 +1,10 @@
-"""Speed of RL on a frozen encoder: through the pixels beside ``VecEncodeObservations``, in turns within one run.
+"""Speed of RL on a frozen encoder: through the pixels and by ``VecEncodeObservations``, in turns within one run.
 
 PPO on ``DistractorPointMaze-v0`` and DQN on ``Nav2D-v0`` with the hyperparameters of ``hyperparams/`` (PPO with shorter
-rollouts, so that a turn holds several); for comparison, the same encoder trained along. Steps per second of processor
-time on one thread, which load on the machine disturbs less than the clock; the speed of each is that of its fastest
-turn. The bound is the speed that ``VecEncodeObservations`` would have if environment and encoder took no time at all,
-so that only Stable-Baselines3's own work on the embeddings remained. ``make bench``.
+rollouts, so that a turn holds several). The same encoder, fine-tuned, is there for comparison. Speed is steps per
+second of processor time on one thread, which load on the machine disturbs less than the clock. The speed of each is
+that of its fastest turn. The bound is the speed that ``VecEncodeObservations`` would have if environment and encoder
+took no time, so that only Stable-Baselines3's work on the embeddings remained. ``make bench``.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from benchmarks.tables import machine, use_one_core, write_page
 
 RESULTS = Path(__file__).parent / "results" / "frozen.md"
 AIM = 5.0
-KINDS = ("trained", "frozen", "encoded")
+KINDS = ("fine-tuned", "frozen", "encoded")
 N_STEPS = 128
 PPO = {"n_steps": N_STEPS, "batch_size": 256, "learning_rate": 2.5e-5}
 DQN = {
@@ -34,15 +34,13 @@ def make_model(algo: str, kind: str) -> Any:
     """A model of the zoo's hyperparameters on an encoder.
 
     :param algo: "ppo" or "dqn"
-    :param kind: "trained" or "frozen" through the pixels, or "encoded" by the environment
+    :param kind: "fine-tuned" or "frozen" through the pixels, or "encoded" by the environment
     """
     import gymnasium as gym
     import stable_baselines3 as sb3
     from torch import nn
 
-    from sb3_abisim import ActionBisimExtractor
-    from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
-    from sb3_abisim.rl.vec_encode import VecEncodeObservations
+    from sb3_abisim import ActionBisimExtractor, BatchedVecEnv, VecEncodeObservations
 
     env_id, n_envs = ("DistractorPointMaze-v0", 16) if algo == "ppo" else ("Nav2D-v0", 1)
     vec_env_class = BatchedVecEnv if n_envs > 1 else sb3.common.vec_env.DummyVecEnv
@@ -103,10 +101,10 @@ def main(argv: list[str] | None = None) -> None:
         for _ in range(args.rounds):
             for kind, run in runs.items():
                 best[kind] = max(best[kind], run())
-        trained, frozen, encoded = (best[kind][0] for kind in KINDS)
+        fine_tuned, frozen, encoded = (best[kind][0] for kind in KINDS)
         bound = best["encoded"][1]
         row = (
-            f"| {title} | {trained:,.0f} | {frozen:,.0f} | {encoded:,.0f} | {encoded / frozen:.1f} | {AIM:.0f} | "
+            f"| {title} | {fine_tuned:,.0f} | {frozen:,.0f} | {encoded:,.0f} | {encoded / frozen:.1f} | {AIM:.0f} | "
             f"{bound:,.0f} ({bound / frozen:.1f}) |"
         )
         print(row, flush=True)
@@ -116,12 +114,12 @@ def main(argv: list[str] | None = None) -> None:
         f"{args.rounds} turns. The ratio is to the frozen encoder through the pixels."
     )
     header = [
-        "| algorithm, environment | trained along | frozen, pixels | `VecEncodeObservations` | ratio | aim | bound |",
+        "| algorithm, environment | fine-tuned | frozen, pixels | `VecEncodeObservations` | ratio | aim | bound |",
         "|---|---:|---:|---:|---:|---:|---:|",
     ]
     tail = (
         "The bound is the speed (and the ratio) that `VecEncodeObservations` would have if environment and encoder",
-        "took no time at all: what is left is Stable-Baselines3's own work on the embeddings (policy, buffers, and",
+        "took no time at all. What is left is Stable-Baselines3's work on the embeddings (policy, buffers, and",
         "updates of the heads with Adam), which no encoder makes cheaper.",
         "",
     )

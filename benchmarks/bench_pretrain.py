@@ -1,10 +1,10 @@
 """Speed of pretraining beside a straightforward PyTorch loop on the same network, loss, batch size and data.
 
 The straightforward loop is a ``torch.utils.data.Dataset`` that indexes one transition after the other and makes it
-float32, a ``DataLoader`` that shuffles and stacks them, pictures channels first, and Adam. Ours is measured with single
-transitions and, where both ends are embedded by the trained encoder, with ``chunk_length: 8``. The loops run in turns on
-one core, each in a process of its own, because ours sets the allocator (``sb3_abisim.common.malloc``). The speed of each is
-that of its fastest turn, by processor time, which load on the machine disturbs less than the clock. ``make bench``.
+float32, a ``DataLoader`` that shuffles and stacks them, channels first, and Adam. Ours is measured with single
+transitions and, where the trained encoder embeds both observations, with ``chunk_length: 8``. The loops run in turns on
+one core, each in its process, because ours sets the allocator (``sb3_abisim.common.malloc``). The speed of each is that
+of its fastest turn, by processor time, which load on the machine disturbs less than the clock. ``make bench``.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from benchmarks.tables import machine, use_one_core, write_page
 RESULTS = Path(__file__).parent / "results" / "pretrain.md"
 AIM = 3.0
 BATCH_SIZE = 256
-# (objective, lengths of runs)
+# (objective, lengths of chunks)
 OBJECTIVES = (("ssi", (1, 8)), ("abisim", (1,)))
 ENV_IDS = ("Nav2D-v0", "PointMaze-v0")
 N_TRANSITIONS = 20_000
@@ -46,16 +46,16 @@ def straightforward(run: Any) -> Iterator[float]:
         def __getitem__(self, i: int) -> Any:
             t = starts[i]
             shard = int(np.searchsorted(offsets, t, side="right")) - 1
-            now, later = (shards[shard][t - offsets[shard] + k] for k in (0, 1))
-            frames = (th.from_numpy(frame.astype(np.float32)) / 255.0 for frame in (now, later))
+            pair = (shards[shard][t - offsets[shard] + k] for k in (0, 1))
+            frames = (th.from_numpy(frame.astype(np.float32)) / 255.0 for frame in pair)
             return *frames, th.as_tensor(actions[t])
 
     module = run.module.to(memory_format=th.contiguous_format)
     module.train()
     optimizer = th.optim.Adam([p for p in module.parameters() if p.requires_grad], lr=1e-3)
     while True:
-        for now, later, taken in th.utils.data.DataLoader(Transitions(), BATCH_SIZE, shuffle=True, drop_last=True):
-            loss, _ = module.loss(TensorBatch.of(now, taken, later))
+        for obs, next_obs, taken in th.utils.data.DataLoader(Transitions(), BATCH_SIZE, shuffle=True, drop_last=True):
+            loss, _ = module.loss(TensorBatch.of(obs, taken, next_obs))
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -83,7 +83,7 @@ def make_run(objective: str, data: Path, base: str | None, folder: Path, chunk_l
 
 
 def serve_turns(pipe: Any, objective: str, data: Path, base: str | None, chunk_length: int) -> None:
-    """In a process of its own: for every number of updates received, send the transitions per second; stop at 0.
+    """In a child process: for every number of updates received, send the transitions per second; stop at 0.
 
     :param pipe: the process's end of a pipe
     :param chunk_length: of our loop; 0 for the straightforward one

@@ -40,8 +40,8 @@ def house(path: Path) -> int:
     """Write a house of at least 150,000 triangles; return their number."""
     import trimesh
 
-    flat = trimesh.creation.box(bounds=[(0, 0, -0.1), (12, 10, 0)])
-    parts = [flat]
+    ground = trimesh.creation.box(bounds=[(0, 0, -0.1), (12, 10, 0)])
+    parts = [ground]
     for x in np.arange(1.0, 12, 2.2):
         parts += [trimesh.creation.box(bounds=[(x, 0.5 + y, 0), (x + 0.12, 2.5 + y, 2.5)]) for y in (0, 3.2, 6.4)]
     mesh = trimesh.util.concatenate(parts).subdivide_to_size(0.08, max_iter=12)
@@ -51,7 +51,7 @@ def house(path: Path) -> int:
 
 
 def preprocessing() -> dict[str, Any]:
-    """Seconds and peak memory of making a map, in a process of its own, and seconds of reading it from the cache."""
+    """Seconds and peak memory of making a map, in another process, and seconds of reading it from the cache."""
     with tempfile.TemporaryDirectory() as folder:
         n_faces = house(Path(folder) / "house.ply")
         environment = {**os.environ, "SB3_ABISIM_CACHE": folder}
@@ -62,7 +62,7 @@ def preprocessing() -> dict[str, Any]:
 
 
 def stepping(n: int, actions: str, rounds: int, calls: int) -> float:
-    """Steps per CPU second of a batch: 128 x 128 RGB-D of the five flats."""
+    """Steps per CPU second of a batch: 128 x 128 RGB-D of the five apartments."""
     import gymnasium as gym
 
     import sb3_abisim  # noqa: F401
@@ -100,8 +100,9 @@ def main(argv: list[str] | None = None) -> None:
     args.output.write_text(json.dumps(result, indent=1) + "\n")
     rows = [f"| {a} | {n} | {s:,.0f} | {TARGETS[n, a] or '':} |" for (n, a), s in speeds.items()]
     text = (
-        f"`python -m benchmarks.bench_scan` on {machine()}; CPU seconds. 128 x 128 RGB-D, five flats. Walking: random "
-        "moves without stop; random: with stop, so that episodes last four steps and most of the time goes into resets."
+        f"`python -m benchmarks.bench_scan` on {machine()}; CPU seconds. 128 x 128 RGB-D, five apartments. Walking: "
+        "random moves without stop; random: with stop, so that episodes last four steps and most of the time goes into "
+        "resets."
     )
     tail = (
         f"A map of {made['triangles']:,} triangles takes {made['seconds']:.1f} s (at most {LONGEST:g}) and "

@@ -1,9 +1,9 @@
 """What a perfect learner of the metric would bring: ``python -m benchmarks.exact_teacher -o FILE [-c 0.9] [--seed 0]``.
 
 Action-bisimulation approaches its metric from recorded transitions. Here the same network, from the same base encoder,
-is fitted to distances that :mod:`sb3_abisim.analysis.exact_metric` has solved, between states of 8,000 layouts of Nav2D. How near it
-comes on other layouts (``sb3-abisim analyze exact FILE``) is what the network can hold, and what RL gains
-with it is what the metric itself is worth.
+is fitted to distances that :mod:`sb3_abisim.analysis.exact_metric` has solved, between states of 8,000 layouts of
+Nav2D. How near it comes on other layouts (``sb3-abisim analyze exact FILE``) is what the network can hold. What RL
+gains with it is what the metric itself is worth.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
 
 ENV_ID = "Nav2D-v0"
-# Far from the held-out layouts of `analyze exact`.
+# Far from the eval layouts of `analyze exact`.
 FIRST_LAYOUT = 2_000_000
 N_AGENTS = 48
 # Pairs of layouts in a batch.
@@ -29,7 +29,7 @@ N_PAIRS = 4
 # Errors are those of square roots, so that small distances count; this keeps their slope at zero finite.
 EPSILON = 0.1
 
-Pair = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]  # pictures of two layouts, exact distances
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]  # observations of two layouts, exact distances
 
 
 def solve(
@@ -40,7 +40,7 @@ def solve(
     :param base: the base encoder
     :param layouts: (n_layouts, SIZE * SIZE)
     :param c: weight of the recursive term
-    :param generator: draws cells and agents
+    :param generator: samples cells and agents
     :param toggle: False leaves out the toggled cells, which no dataset of layouts of 2x2 blocks shows
     :return: N_AGENTS states on either side; with toggled cells, every second pair is the same agents
     """
@@ -66,7 +66,7 @@ def solve(
         else:
             agents, others = generator.choice(agents, N_AGENTS), generator.choice(others, N_AGENTS)
         rows, columns = np.searchsorted(free, agents), np.searchsorted(other_free, others)
-        pairs.append((nav.pictures(here, agents), nav.pictures(there, others), metric[np.ix_(rows, columns)]))
+        pairs.append((nav.observations(here, agents), nav.observations(there, others), metric[np.ix_(rows, columns)]))
     return pairs
 
 
@@ -78,7 +78,7 @@ def fit(
     :param encoder: trained in place
     :param pairs: from :func:`solve`
     :param n_updates: steps of Adam, its learning rate falling from 1e-3 to 2e-5
-    :param generator: draws batches
+    :param generator: samples batches
     :param toggle: as for :func:`solve`
     """
     optimizer = th.optim.Adam(encoder.parameters(), lr=1e-3)
@@ -86,8 +86,8 @@ def fit(
     bar = tqdm(range(n_updates), desc="fit", file=sys.stderr)
     for update in bar:
         chosen = N_PAIRS * generator.integers(len(pairs) // N_PAIRS) + np.arange(N_PAIRS)
-        frames = np.concatenate([pairs[k][side] for k in chosen for side in (0, 1)])
-        features = encoder(th.as_tensor(frames).float() / 255).view(N_PAIRS, 2, N_AGENTS, -1)
+        observations = np.concatenate([pairs[k][side] for k in chosen for side in (0, 1)])
+        features = encoder(th.as_tensor(observations).float() / 255).view(N_PAIRS, 2, N_AGENTS, -1)
         learned = th.cdist(features[:, 0], features[:, 1], p=1.0)
         exact = th.as_tensor(np.stack([pairs[k][2] for k in chosen]), dtype=th.float32)
         error = ((learned + EPSILON).sqrt() - (exact + EPSILON).sqrt()) ** 2
@@ -118,14 +118,14 @@ def main() -> None:
     th.manual_seed(args.seed)
     generator = np.random.default_rng(args.seed)
     env = gym.make(ENV_ID)
-    layouts = nav.held_out_layouts(ENV_ID, args.n_layouts, FIRST_LAYOUT + args.seed * args.n_layouts)
+    layouts = nav.eval_layouts(ENV_ID, args.n_layouts, FIRST_LAYOUT + args.seed * args.n_layouts)
     base = load_encoder(args.base)
     pairs = solve(base.encoder.eval(), layouts, args.c, generator, args.toggle)
     encoder = load_encoder(args.base).encoder.train().requires_grad_(True)
     fit(encoder, pairs, args.n_updates, generator, args.toggle)
     encoder.eval()
-    frames = np.concatenate([here[:8] for here, _, _ in pairs[:512]])
-    encoder.standardize(th.as_tensor(frames).float() / 255)
+    observations = np.concatenate([here[:8] for here, _, _ in pairs[:512]])
+    encoder.standardize(th.as_tensor(observations).float() / 255)
     save_encoder(
         args.output,
         encoder,
@@ -144,7 +144,7 @@ def main() -> None:
             **({} if args.toggle else {"toggle": False}),
         },
         dataset_hash="exact",
-        reference_observations=frames[:4],
+        reference_observations=observations[:4],
     )
 
 

@@ -52,7 +52,7 @@ def oracle_player(env: Any, _: Any) -> NDArray[np.int64]:
 
 
 def model_player(model: Any) -> Player:
-    """Acts on pictures, sampling from its policy as in training."""
+    """Acts on observations by its stochastic policy, as in training."""
     return lambda _, observations: model.predict(observations, deterministic=False)[0]
 
 
@@ -98,7 +98,7 @@ def learning_curve(run: Path) -> dict[str, list[float]]:
     return curve
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def plot(result: dict[str, Any], path: Path) -> None:
     """Success and SPL during training, beside the agents that do not learn."""
     import matplotlib
 
@@ -122,7 +122,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scan_learning", description=__doc__)
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="folder of a run of rl-zoo3")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="JSON file")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="PNG of the learning curves")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="PNG of the learning curves")
     parser.add_argument("--env-kwargs", type=json.loads, metavar="JSON", help="(default: those of the first run)")
     parser.add_argument("--episodes", type=int, default=200, help="of each agent (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1000, help="of the first copy (default: %(default)s)")
@@ -151,8 +151,8 @@ def main(argv: list[str] | None = None) -> None:
     for name, scores in [*result["agents"].items(), *((run["name"], run["final"]) for run in result["runs"])]:
         print(f"{name}: success {scores['success']:.3f}, SPL {scores['spl']:.3f}, {scores['steps']:.0f} steps")
     args.output.write_text(json.dumps(result, indent=1) + "\n")
-    if args.picture is not None:
-        draw(result, args.picture)
+    if args.figure is not None:
+        plot(result, args.figure)
 
 
 if __name__ == "__main__":

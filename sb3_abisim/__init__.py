@@ -15,11 +15,14 @@ from sb3_abisim.registry import EnvTraits, register_method, register_network, re
 if TYPE_CHECKING:
     from sb3_abisim.data.collect import collect
     from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.data.format import CUT, TERMINATED, TRUNCATED
+    from sb3_abisim.data.writer import Segment, write_dataset
+    from sb3_abisim.envs.base import BatchEnv, SingleEnv
     from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
     from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
     from sb3_abisim.networks.base import Encoder
     from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
-    from sb3_abisim.objectives.base import Objective
+    from sb3_abisim.objectives.base import Objective, TensorBatch
     from sb3_abisim.pretraining.pretrain import pretrain
     from sb3_abisim.rl.callbacks import EncoderCallback
     from sb3_abisim.rl.merge import merge_encoder
@@ -28,12 +31,19 @@ if TYPE_CHECKING:
 
 # Public name: the module that defines it.
 _PUBLIC = {
+    "CUT": "data.format",
+    "TERMINATED": "data.format",
+    "TRUNCATED": "data.format",
+    "BatchEnv": "envs.base",
     "BatchedVecEnv": "envs.sb3_vec_env",
     "Encoder": "networks.base",
     "EncoderCallback": "rl.callbacks",
     "EncoderLRAdam": "rl.optimizers",
     "Objective": "objectives.base",
     "PointMazePixels": "envs.point_maze.pixel_wrapper",
+    "Segment": "data.writer",
+    "SingleEnv": "envs.base",
+    "TensorBatch": "objectives.base",
     "TransitionDataset": "data.dataset",
     "VecEncodeObservations": "rl.vec_encode",
     "collect": "data.collect",
@@ -41,10 +51,15 @@ _PUBLIC = {
     "merge_encoder": "rl.merge",
     "pretrain": "pretraining.pretrain",
     "save_encoder": "networks.encoder_file",
+    "write_dataset": "data.writer",
 }
 _EXTRACTORS = "sb3_abisim.rl.extractors"
 
 __all__ = [
+    "CUT",
+    "TERMINATED",
+    "TRUNCATED",
+    "BatchEnv",
     "BatchedVecEnv",
     "Encoder",
     "EncoderCallback",
@@ -52,6 +67,9 @@ __all__ = [
     "EnvTraits",
     "Objective",
     "PointMazePixels",
+    "Segment",
+    "SingleEnv",
+    "TensorBatch",
     "TransitionDataset",
     "VecEncodeObservations",
     "__version__",
@@ -64,6 +82,7 @@ __all__ = [
     "register_reader",
     "register_traits",
     "save_encoder",
+    "write_dataset",
 ]
 
 

@@ -1,7 +1,7 @@
-"""The whole product in about ten minutes on two cores: ``sb3-abisim demo -o demo``.
+"""From data to a trained agent in about ten minutes on two cores: ``sb3-abisim demo -o demo``.
 
 Runs the commands that a user would type, prints each before it starts, and ends with a learning curve, a GIF of the
-trained agent and the folder where everything lies. The budget is far below the paper's; it shows the way, not a result.
+trained agent and the folder where everything lies. The budget is far below the paper's: it shows the steps, no result.
 """
 
 import argparse
@@ -50,11 +50,11 @@ def newest_run(folder: Path) -> Path:
     return max((folder / "logs" / "ppo").glob(f"{ENV_ID}_*"), key=lambda run: run.stat().st_mtime)
 
 
-def draw_learning_curve(run: Path, path: Path, n_smooth: int = 100) -> None:
+def plot_learning_curve(run: Path, path: Path, n_smooth: int = 100) -> None:
     """Plot the return and the success rate of the training episodes.
 
     :param run: zoo run folder with monitor files
-    :param path: the picture to write
+    :param path: the PNG file to write
     :param n_smooth: episodes in a mean
     """
     import matplotlib
@@ -82,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     :param argv: arguments, None for those of the process
     """
-    parser = make_parser("demo", "The whole way in about ten minutes on two cores.", "demo -o demo")
+    parser = make_parser("demo", "From data to a trained agent in about ten minutes on two cores.", "demo -o demo")
     parser.add_argument("-o", "--output", default="demo", metavar="DIR", help="folder for everything (default: demo)")
     parser.add_argument("--n-transitions", type=int, default=50_000)
     parser.add_argument("--n-updates", type=int, default=2_000)
@@ -101,7 +101,7 @@ def _command(args: argparse.Namespace) -> None:
         print(f"\n$ {shlex.join([PROGRAM, *words[1:]])}", flush=True)
         subprocess.run([sys.executable, "-m", *words], check=True)
     zoo_run = newest_run(folder)
-    draw_learning_curve(zoo_run, folder / "learning_curve.png")
+    plot_learning_curve(zoo_run, folder / "learning_curve.png")
     success = record(zoo_run, folder / "agent.gif")
     minutes = (time.monotonic() - start) / 60
     print(f"\nDone in {minutes:.1f} minutes; the agent reached the goal in {success:.0%} of the recorded episodes.")

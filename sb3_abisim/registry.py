@@ -7,6 +7,7 @@ imported (``--packages`` of every command), or by an entry point in the group ``
 
 import functools
 import importlib
+import os
 import re
 import warnings
 from collections.abc import Callable, Mapping
@@ -33,6 +34,8 @@ class Method:
     :param color: in reports, as matplotlib takes it; None for one that is free
     :param curve: the term of its log that shows how pretraining went, without ``train/`` or ``eval/``
     :param results: the terms that its row in the table of encoders shows
+    :param hyperparams: YAML file of its pretraining settings by environment id; None for this package's
+        ``hyperparams/pretrain/<name>.yml``, or where there is none for the defaults
     """
 
     name: str
@@ -43,6 +46,7 @@ class Method:
     color: str | None
     curve: str
     results: tuple[str, ...]
+    hyperparams: str | os.PathLike[str] | None
 
     @property
     def is_pretrained(self) -> bool:
@@ -158,6 +162,7 @@ def register_method(
     color: str | None = None,
     curve: str = "accuracy",
     results: tuple[str, ...] = ("accuracy",),
+    hyperparams: str | os.PathLike[str] | None = None,
 ) -> None:
     """Add a method; its features extractor is then importable from ``sb3_abisim``.
 
@@ -169,13 +174,14 @@ def register_method(
     :param color: in reports, as matplotlib takes it
     :param curve: see :class:`Method`
     :param results: see :class:`Method`
+    :param hyperparams: see :class:`Method`
     :raises ValueError: for a name that is taken or cannot be one
     """
     class_name = extractor or "".join(part.capitalize() for part in re.split(r"[_.-]", name)) + "Extractor"
     for other in _METHODS.by_name.values():
         if other.extractor == class_name:
             raise ValueError(f"{class_name} is the extractor of method {other.name!r}; give another with extractor=")
-    record = Method(name, objective, label or name, class_name, base, color, curve, results)
+    record = Method(name, objective, label or name, class_name, base, color, curve, results, hyperparams)
     _METHODS.add(name, record)
 
 

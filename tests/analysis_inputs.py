@@ -8,6 +8,7 @@ from torch import nn
 
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import EncoderFile
+from sb3_abisim.registry import networks
 
 
 class Masked(nn.Module):
@@ -18,18 +19,19 @@ class Masked(nn.Module):
         self.kept = th.as_tensor(mask).flatten().nonzero()[:, 0]
 
     def forward(self, observations):
-        # The encoder has mapped 0..1 to -1..1.
-        return ((observations + 1) / 2).flatten(1)[:, self.kept]
+        return observations.flatten(1)[:, self.kept]
 
 
 def file_of(layers, shape, objective="ssi", seed=0):
     """An encoder file that was never on a disk."""
     n_features = len(layers.kept) if isinstance(layers, Masked) else int(np.prod(shape[1:]))
-    encoder = Encoder(layers, n_features, {})
+    # What an untrained encoder of the same network is made of.
+    network = next(name for name, network in networks().items() if network.observation_shape == shape)
+    encoder = Encoder(layers, n_features, network, {}, shape)
     metadata = {"objective": objective, "settings": {"seed": seed}, "env_id": "?"}
     return EncoderFile(Path("nowhere"), "0" * 64, encoder, metadata)
 
 
 def identity(shape):
-    """An encoder that embeds a picture as its pixels."""
+    """An encoder that embeds an observation as its pixels."""
     return file_of(Masked(np.ones(shape)), shape)

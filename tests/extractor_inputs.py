@@ -1,22 +1,24 @@
-"""What the tests of the extractors share: small algorithms, an environment of random pictures, encoder files."""
+"""What the tests of the extractors share: small algorithms, an environment of random images, encoder files."""
 
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import sb3_contrib
 import stable_baselines3 as sb3
 import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim import registry
+from sb3_abisim.networks.base import make_encoder
 from sb3_abisim.networks.encoder_file import save_encoder
 from sb3_abisim.rl.extractors import ActionBisimExtractor
 
 SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
-FRAMES = np.random.default_rng(0).integers(0, 256, (6, 3, 15, 15), np.uint8)
+OBSERVATIONS = np.random.default_rng(0).integers(0, 256, (6, 3, 15, 15), np.uint8)
 
 ON_POLICY = {"n_steps": 8}
 PPO_LIKE = {**ON_POLICY, "batch_size": 8}
@@ -39,8 +41,8 @@ SHARING = {"PPO": False, "A2C": False, "TRPO": False, "RecurrentPPO": False, "SA
 VARIANTS = [(name, False) for name in ALGORITHMS] + [(name, True) for name in SHARING]
 
 
-class Pictures(gym.Env[Any, Any]):
-    """Random pictures; the reward depends on picture and action."""
+class RandomImages(gym.Env[Any, Any]):
+    """Random image observations; the reward depends on observation and action."""
 
     def __init__(self, continuous: bool = False, channels_last: bool = False) -> None:
         self.observation_space = spaces.Box(0, 255, (15, 15, 3) if channels_last else (3, 15, 15), np.uint8)
@@ -48,32 +50,35 @@ class Pictures(gym.Env[Any, Any]):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
-        return self._draw(), {}
+        return self._sample(), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        picture = self._draw()
+        observation = self._sample()
         return (
-            picture,
-            float(picture.flat[0]) / 255 + float(np.sum(action)),
+            observation,
+            float(observation.flat[0]) / 255 + float(np.sum(action)),
             bool(self.np_random.random() < 0.2),
             False,
             {},
         )
 
-    def _draw(self) -> Any:
+    def _sample(self) -> Any:
         return self.np_random.integers(0, 256, self.observation_space.shape, np.uint8)
 
 
-class BatchNormEncoder(Encoder):
+def batch_norm_network(observation_space: gym.Space[Any], width: int = 4) -> nn.Module:
     """A network whose evaluation and training modes differ."""
+    return nn.Sequential(
+        nn.Conv2d(3, width, 3, stride=3), nn.BatchNorm2d(width), nn.ReLU(), nn.Flatten(), nn.Linear(25 * width, 6)
+    )
 
-    observation_shape = (3, 15, 15)
 
-    def __init__(self, width: int = 4) -> None:
-        layers = nn.Sequential(
-            nn.Conv2d(3, width, 3, stride=3), nn.BatchNorm2d(width), nn.ReLU(), nn.Flatten(), nn.Linear(25 * width, 6)
-        )
-        super().__init__(layers, 6, {"width": width})
+def register_batch_norm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Register it as "BatchNorm", for one test."""
+    registry.networks()
+    monkeypatch.setitem(
+        registry._NETWORKS.by_name, "BatchNorm", registry.Network("BatchNorm", batch_norm_network, None)
+    )
 
 
 def write(path: Path, network: str | None = None, objective: str = "abisim", **kwargs: Any) -> Path:
@@ -93,7 +98,7 @@ def write(path: Path, network: str | None = None, objective: str = "abisim", **k
         objective=objective,
         settings={},
         dataset_hash="0" * 64,
-        reference_observations=FRAMES[:2],
+        reference_observations=OBSERVATIONS[:2],
     )
     return path
 
@@ -111,5 +116,5 @@ def build(name: str, path: Path | str, freeze: bool, other_sharing: bool = False
     if name == "RecurrentPPO":
         policy_kwargs["lstm_hidden_size"] = 8
     policy = "CnnLstmPolicy" if name == "RecurrentPPO" else "CnnPolicy"
-    env = Pictures(continuous=name in ("SAC", "TD3", "TQC"))
+    env = RandomImages(continuous=name in ("SAC", "TD3", "TQC"))
     return algorithm(policy, env, seed=5, device="cpu", policy_kwargs=policy_kwargs, **settings)

@@ -1,7 +1,7 @@
-"""Environments whose pictures say where they come from; imported by tests and, in child processes, by --gym-packages.
+"""Environments whose observations show where they come from; child processes import them by ``--packages``.
 
-A picture's three channels hold the step within the episode, the episode's random number, and the action that led
-here (255 for none). A frame from the wrong step, episode or copy therefore shows as a wrong number.
+An observation's three channels hold the step within the episode, the episode's random number, and the action that led
+here (255 for none). An observation of the wrong step, episode or copy therefore shows as a wrong number.
 """
 
 from typing import Any
@@ -28,8 +28,9 @@ class IndexVectorEnv(BatchEnv):
         autoreset: bool = True,
         offset: int = 0,
     ) -> None:
-        pictures = gym.spaces.Box(0, 255, SHAPE, np.uint8)
-        super().__init__(num_envs, pictures, gym.spaces.Discrete(3, start=1), max_episode_steps, render_mode, autoreset)
+        observation_space = gym.spaces.Box(0, 255, SHAPE, np.uint8)
+        action_space = gym.spaces.Discrete(3, start=1)
+        super().__init__(num_envs, observation_space, action_space, max_episode_steps, render_mode, autoreset)
         self.offset = offset
         self._step, self._length, self._number, self._action = np.zeros((4, num_envs), dtype=np.int64)
 
@@ -58,7 +59,7 @@ class IndexVectorEnv(BatchEnv):
 
 
 class PlainEnv(gym.Env):
-    """An environment of somebody else: continuous actions, no batch, no factors; pictures as above, no action."""
+    """An environment of somebody else: continuous actions, no batch, no factors; observations as above, no action."""
 
     def __init__(self, channels_last: bool = False) -> None:
         self.channels_last = channels_last
@@ -78,8 +79,8 @@ class PlainEnv(gym.Env):
 
     def _observe(self) -> NDArray[np.uint8]:
         values = np.array([self._step, self._number, NO_ACTION], dtype=np.uint8)
-        picture = np.broadcast_to(values[:, None, None], SHAPE)
-        return np.ascontiguousarray(np.moveaxis(picture, 0, -1) if self.channels_last else picture)
+        observation = np.broadcast_to(values[:, None, None], SHAPE)
+        return np.ascontiguousarray(np.moveaxis(observation, 0, -1) if self.channels_last else observation)
 
 
 gym.register("IndexEnv-v0", entry_point=PlainEnv, vector_entry_point=IndexVectorEnv, max_episode_steps=LIMIT)

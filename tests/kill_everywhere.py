@@ -1,4 +1,4 @@
-"""Run by test_collect.py in a process of its own: ``kill_everywhere.py WORK FIRST THEN STRIDE``.
+"""Run by test_collect.py as a child process: ``kill_everywhere.py WORK FIRST THEN STRIDE``.
 
 Collects FIRST transitions (none for 0), then THEN, and kills that second collection right before a system call that
 changes the folder: the first such call, the one STRIDE later, and so on, each time in a new folder. After each kill it
@@ -13,9 +13,8 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import index_env  # noqa: F401  registers ids
 import tqdm  # noqa: F401  here once instead of in every child
-from test_collect import tree
+from dataset_inputs import tree
 
 from sb3_abisim.data import collect as collect_module
 

@@ -5,25 +5,34 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.heads import MLP
+from sb3_abisim.networks.paper import PaperEncoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
 
 DISCRETE = gym.spaces.Discrete(3)
 CONTINUOUS = gym.spaces.Box(-1, 1, (2,), np.float32)
 
 
-class LineEncoder(Encoder):
+class LineEncoder(PaperEncoder):
     """Vectors instead of images, for speed."""
 
     observation_shape = (1, 1, 4)
 
-    def __init__(self, features_dim: int = 5) -> None:
-        super().__init__(nn.Sequential(nn.Flatten(), MLP(4, 16, features_dim)), features_dim, {})
+    def __init__(self, features_dim: int = 5, hidden_dim: int = 16) -> None:
+        layers = nn.Sequential(nn.Flatten(), MLP(4, hidden_dim, features_dim))
+        super().__init__(layers, features_dim, {"n_input_channels": 1, "features_dim": features_dim})
+
+
+@th.no_grad()
+def change_weights(module: nn.Module, seed: int = 4) -> None:
+    """Add noise to every weight, so that a module differs from the one that it was copied from."""
+    generator = th.Generator().manual_seed(seed)
+    for parameter in module.parameters():
+        parameter.add_(0.5 * th.randn(parameter.shape, generator=generator))
 
 
 def make_batch(action_space, n=256, seed=0, noise=0.0):
-    """s is random, s' is s moved by the action along its first numbers; the other numbers are drawn anew."""
+    """s is random, s' is s moved by the action along its first numbers; the other numbers are sampled anew."""
     generator = th.Generator().manual_seed(seed)
     s = th.rand(n, 1, 1, 4, generator=generator)
     s_next = s.clone()

@@ -1,4 +1,4 @@
-"""The solid part of a point maze, drawn anew for tests."""
+"""The solid part of a point maze, rendered once more for tests."""
 
 import numpy as np
 

@@ -1,8 +1,12 @@
 """What the tests of pretraining share: a small dataset, and runs of seconds."""
 
+from pathlib import Path
+
 from sb3_abisim.data.collect import collect
+from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.pretraining.config import load_config
 from sb3_abisim.pretraining.pretrain import pretrain
+from sb3_abisim.pretraining.trainer import PretrainRun
 
 SETTINGS = {"n_updates": 30, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5}
 
@@ -16,3 +20,10 @@ def collect_grids(tmp_path_factory):
 def run(data, output, objective="ssi", callback=None, **settings):
     config = load_config(objective, "Nav2D-v0", {**SETTINGS, **settings})
     return pretrain(objective, data, output, config, device="cpu", progress_bar=False, verbose=0, callback=callback)
+
+
+def make_run(data, objective="ssi", output=Path("x.safetensors"), **settings):
+    """A run that has not begun."""
+    config = load_config(objective, "Nav2D-v0", {**SETTINGS, **settings})
+    dataset = TransitionDataset(data, eval_fraction=config.eval_fraction)
+    return PretrainRun(objective, dataset, output, config, None, 0, "cpu")

@@ -24,9 +24,9 @@ def box(x0, y0, x1, y1, z0, z1, color):
 def checkers():
     """Red and blue squares of 8 x 8 pixels, and one green corner (at the left of the first row)."""
     y, x = np.mgrid[:64, :64]
-    picture = np.where(((x // 8 + y // 8) % 2)[..., None], (220, 40, 40), (40, 40, 220)).astype(np.uint8)
-    picture[:8, :8] = (30, 200, 30)
-    return Image.fromarray(picture)
+    checked = np.where(((x // 8 + y // 8) % 2)[..., None], (220, 40, 40), (40, 40, 220)).astype(np.uint8)
+    checked[:8, :8] = (30, 200, 30)
+    return Image.fromarray(checked)
 
 
 def floor(textured=True, size=(5, 4), image=None):
@@ -75,7 +75,7 @@ def write(scene, path: Path):
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory, monkeypatch):
+def empty_cache(tmp_path_factory, monkeypatch):
     """Import it where a test must not see maps of earlier runs."""
     monkeypatch.setenv("SB3_ABISIM_CACHE", str(tmp_path_factory.mktemp("scans")))
 
@@ -88,3 +88,28 @@ def empty_room(width=8.0, depth=6.0, walls=()):
         walkable[wall] = False
     colors = np.random.default_rng(0).integers(0, 255, (*shape, 3)).astype(np.uint8)
     return ScanMap(colors, np.where(walkable, 0, 1).astype(np.float32), walkable, 0.05, (0.0, depth), "room")
+
+
+def pixel(scan, x, y):
+    """Row and column of a point of a map."""
+    return int((scan.origin[1] - y) / scan.meters_per_pixel), int((x - scan.origin[0]) / scan.meters_per_pixel)
+
+
+@pytest.fixture(name="house_file", scope="module")
+def file_of_the_house(tmp_path_factory):
+    return write(y_up(house()), tmp_path_factory.mktemp("house") / "house.glb")
+
+
+@pytest.fixture(name="scan")
+def map_of_the_house(house_file):
+    return ScanMap.from_mesh(house_file)
+
+
+@pytest.fixture(name="room", scope="module")
+def map_of_a_room():
+    return empty_room()
+
+
+def start_at(env, start, goal, heading=0.0):
+    """Begin an episode with everything given."""
+    return env.reset(seed=0, options={"goal": goal, "start": start, "heading": heading})

@@ -19,14 +19,14 @@ def test_demo_leaves_a_curve_a_gif_and_a_run(tmp_path, capfd):
     run = newest_run(tmp_path)
     assert (run / "DistractorPointMaze-v0.zip").is_file()
     with Image.open(tmp_path / "agent.gif") as gif:
-        # Each episode has at least one picture and its last one stays for a second.
+        # Each episode has at least one frame and its last one stays for a second.
         assert gif.n_frames > 2 * 4
         assert gif.size == (PIXELS, PIXELS)
-    with Image.open(tmp_path / "learning_curve.png") as picture:
-        assert len(picture.convert("RGB").getcolors(1 << 24)) > 10, "the curve must be visible"
+    with Image.open(tmp_path / "learning_curve.png") as image:
+        assert len(image.convert("RGB").getcolors(1 << 24)) > 10, "the curve must be visible"
 
 
-def test_what_is_missing_is_said_before_the_work(tmp_path, capsys, monkeypatch):
+def test_what_is_missing_is_reported_before_the_work(tmp_path, capsys, monkeypatch):
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "PIL" else find_spec(name))
     with pytest.raises(SystemExit) as stopped:

@@ -3,6 +3,8 @@
 import pytest
 from stable_baselines3.common.monitor import load_results
 
+from sb3_abisim.__main__ import main
+
 N_TIMESTEPS = 60_000
 RANDOM_RETURN = -102  # of uniform actions in PointMaze-v0, mean over 2,000 episodes
 GOOD_RETURN = -60
@@ -11,8 +13,6 @@ GOOD_RETURN = -60
 @pytest.mark.slow
 @pytest.mark.parametrize("env_id", ["PointMaze-v0", "DistractorPointMaze-v0"])
 def test_ppo_learns_on_a_frozen_encoder(tmp_path, env_id):
-    from sb3_abisim.zoo.manager import main
-
     command = f"train --algo ppo --env {env_id} --conf-file abisim,frozen -n {N_TIMESTEPS} --seed 0 --verbose 0"
     faster = "-params n_envs:16 n_steps:128 batch_size:256 n_epochs:4 learning_rate:3e-4"
     main([*command.split(), "--eval-freq", "-1", "-f", str(tmp_path), *faster.split()])

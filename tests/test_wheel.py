@@ -49,7 +49,7 @@ def test_train_from_the_wheel_in_an_empty_folder(installed: Path, tmp_path: Path
     argv += ["--eval-freq", "-1", "-params", "n_envs:2", "n_steps:32", "batch_size:32"]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(installed)}
     done = subprocess.run(
-        [sys.executable, "-m", "sb3_abisim.zoo.manager", *argv],
+        [sys.executable, "-m", "sb3_abisim", *argv],
         cwd=tmp_path,
         env=environment,
         capture_output=True,
@@ -57,5 +57,5 @@ def test_train_from_the_wheel_in_an_empty_folder(installed: Path, tmp_path: Path
     )
     assert done.returncode == 0, done.stderr
     assert f"Loading hyperparameters from: {installed / 'sb3_abisim' / 'hyperparams' / 'ppo.yml'}" in done.stdout
-    assert f"digest {load_encoder('DistractorPointMaze-v0/abisim').hash}" in done.stdout
+    assert f"hash {load_encoder('DistractorPointMaze-v0/abisim').hash}" in done.stdout
     assert (tmp_path / "logs/ppo/DistractorPointMaze-v0_1/DistractorPointMaze-v0.zip").is_file()

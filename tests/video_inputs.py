@@ -1,4 +1,4 @@
-"""What the tests of a user's own videos share: an own cache, and small clips."""
+"""What the tests of custom videos share: an empty cache, and small clips."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ Image = pytest.importorskip("PIL.Image")
 
 
 @pytest.fixture(autouse=True, name="cache")
-def own_cache(tmp_path, monkeypatch):
+def empty_cache(tmp_path, monkeypatch):
     folder = tmp_path / "cache"
     monkeypatch.setenv("SB3_ABISIM_CACHE", str(folder))
     return folder

@@ -1,11 +1,15 @@
-"""What the tests of the zoo's side share: an encoder of random weights, and settings small enough for a test."""
+"""What the tests of the zoo share: an encoder of random weights, and settings small enough for a test."""
 
+import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch as th
 
+from sb3_abisim.__main__ import main
 from sb3_abisim.networks.base import make_encoder
 from sb3_abisim.networks.encoder_file import save_encoder
 
@@ -16,12 +20,12 @@ SMALL = {
 }
 
 
-def write_encoder(path: Path, env_id: str, objective: str = "abisim") -> str:
+def write_encoder(path: Path, env_id: str, objective: str = "abisim", **network_kwargs: Any) -> str:
     env = gym.make(env_id)
     th.manual_seed(len(path.name))
     return save_encoder(
         path,
-        make_encoder(env.observation_space),
+        make_encoder(env.observation_space, **network_kwargs),
         observation_space=env.observation_space,
         action_space=env.action_space,
         env_id=env_id,
@@ -31,3 +35,9 @@ def write_encoder(path: Path, env_id: str, objective: str = "abisim") -> str:
         dataset_hash="0" * 64,
         reference_observations=np.stack([env.reset(seed=seed)[0] for seed in range(2)]),
     )
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *words: str) -> None:
+    """``sb3-abisim`` with these words, in this process."""
+    monkeypatch.setattr(sys, "argv", [])
+    main(words)

@@ -21,7 +21,7 @@ from PIL import Image
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.envs.backgrounds.clips import SIZE, array_hash, split_groups
 from sb3_abisim.envs.backgrounds.photo_pan import MEDIA_FOLDER, render_pan
-from sb3_abisim.envs.backgrounds.video import decode_video, shrink
+from sb3_abisim.envs.backgrounds.video_frames import decode_video, shrink
 
 SEED = 0
 SHORT_SIDE = 112  # pixels of a stored photograph
@@ -69,7 +69,7 @@ def read_photo(path: Path) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.asarray(small).transpose(2, 0, 1))
 
 
-def draw_path(height: int, width: int, generator: np.random.Generator) -> list[list[int]]:
+def sample_path(height: int, width: int, generator: np.random.Generator) -> list[list[int]]:
     """Control points (top, left, side) of a camera's path, uniform over the windows that fit."""
     points = []
     for _ in range(N_CONTROL_POINTS):
@@ -116,12 +116,12 @@ def main(argv: list[str] | None = None) -> None:
     generator = np.random.default_rng(SEED)
     arrays, entries = {}, []
     photos = sorted((originals / "photos").glob("*.jpg"))
-    _, unseen = split_groups([photo.stem for photo in photos], SEED, N_EVAL / len(photos))
+    _, eval_groups = split_groups([photo.stem for photo in photos], SEED, N_EVAL / len(photos))
     for photo in photos:
         pixels = read_photo(photo)
-        path = draw_path(pixels.shape[1], pixels.shape[2], generator)
+        path = sample_path(pixels.shape[1], pixels.shape[2], generator)
         arrays[photo.stem] = np.diff(pixels, axis=2, prepend=np.uint8(0))
-        split = "eval" if photo.stem in unseen else "train"
+        split = "eval" if photo.stem in eval_groups else "train"
         clip = entry(photo.stem, "photo", split, photo.stem, render_pan(pixels, path, LENGTH))
         entries.append(clip | {"path": path})
     city = np.stack([shrink(image) for image in decode_video(originals / "city_timelapse_CC0.mpg")])

@@ -18,11 +18,15 @@ START = "index.md"
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 # The reference, in the order of the data.
 MODULES = (
-    "extractors", "optimizers", "vec_env", "frozen", "film", "zoo", "collect", "dataset", "minari_io", "pretrain",
-    "pretrain_config", "objectives.base", "objectives.inverse", "objectives.info_nce", "objectives.beta_vae",
-    "objectives.curl", "objectives.action_bisim", "networks", "checkpoint", "tabular", "analysis.nav2d_exact",
-    "analysis.leak", "lockstep", "envs.nav2d", "envs.point_maze", "envs.distractors", "envs.pixel_wrapper",
-    "envs.scan_nav", "envs.scan_map", "benchmark.evaluate", "benchmark.runs",
+    "registry", "common.cli", "envs.base", "envs.sb3_vec_env", "envs.nav2d",
+    "envs.point_maze.env", "envs.point_maze.distractors", "envs.point_maze.pixel_wrapper", "envs.scan_nav.env", "envs.scan_nav.map",
+    "networks.base", "networks.paper", "networks.encoder_file", "data.collect", "data.dataset",
+    "data.writer", "data.readers.minari", "objectives.base", "objectives.abisim", "objectives.ssi",
+    "objectives.acro", "objectives.info_nce",
+    "objectives.beta_vae", "objectives.curl", "pretraining.pretrain", "pretraining.config",
+    "pretraining.card", "rl.extractors", "rl.checks", "rl.vec_encode", "rl.merge",
+    "rl.callbacks", "rl.optimizers", "zoo.methods", "zoo.manager", "zoo.runs",
+    "zoo.evaluate", "zoo.record", "analysis.exact_metric", "analysis.nav2d_exact", "analysis.leak",
 )  # fmt: skip
 
 

@@ -1,30 +1,32 @@
-"""Write ``encoders/README.md`` from the cards of the shipped encoders: ``python tools/make_encoder_table.py``."""
+"""Write ``encoders/README.md`` from the model cards of the shipped encoders: ``python tools/make_encoder_table.py``."""
 
 import argparse
-import json
 from pathlib import Path
+
+from sb3_abisim.pretraining.card import read_card
+from sb3_abisim.registry import get_method
 
 ENCODERS = Path(__file__).parent.parent / "encoders"
 HEAD = """# Shipped encoders
 
-Pretrained with the settings of `hyperparams/pretrain/` on uniformly random actions, seed 0, one thread. The card beside
-each file (`.json`) holds the commands that made it, the digest of its data, all curves and the settings. This table is
-made of the cards by `tools/make_encoder_table.py`; its numbers are those of the last row of the log, on held-out
-episodes.
+They were pretrained with the settings of `hyperparams/pretrain/` on uniformly random actions, with seed 0 and one
+thread. The model card beside each file (`.json`) holds the commands that made it, the hash of its data, the settings
+and all curves. Names in a card are those of the version that wrote it.
 
-* `accuracy` of `ssi` and `acro`: share of actions told from two pictures one or k steps apart (for continuous actions,
-  the coefficient of determination). A blocked move looks like any other blocked move, so 1 cannot be reached.
+`tools/make_encoder_table.py` makes this table of the cards. Results are those of the last row of the log, on the eval
+split.
+
+* `accuracy` of `ssi` and `acro`: share of actions predicted from two observations one or k steps apart. For continuous
+  actions, it is the coefficient of determination. One blocked move looks like any other, so 1 cannot be reached.
 * `accuracy` of `info_nce`: share of actions ranked first, among all four or, continuous, among those of a batch of 256.
 * `accuracy` of `curl`: share of keys found in a batch of 256.
-* `squared_error` of `beta_vae`: of the reconstruction, per intensity in 0..1; `kl` is in nats per picture.
-* `metric` and `distance` of `abisim`: the loss (mean squared difference between distance and target, sampling noise of
-  the target included; with `pairs: near` relative to the base distance, as trained), the mean distance it belongs to.
+* `squared_error` of `beta_vae`: of the reconstruction, per intensity in 0..1. `kl` is in nats per observation.
+* `metric_loss` of `abisim`: mean squared difference between distance and target, the target's sampling noise included.
+  With `pairs: nearest`, the difference is relative to the base distance, as in training. `distance` is the mean.
 
-| encoder | transitions | updates | parameters | features | kB | held-out result |
+| encoder | transitions | updates | parameters | features | kB | result on the eval split |
 |---|---:|---:|---:|---:|---:|---|
 """
-
-RESULTS = {"beta_vae": ("squared_error", "kl"), "abisim": ("metric", "distance")}
 
 
 def main() -> None:
@@ -32,9 +34,9 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     rows = []
     for path in sorted(ENCODERS.glob("*/*.json")):
-        card = json.loads(path.read_text())
-        names = RESULTS.get(card["settings"]["objective"], ("accuracy",))
-        result = ", ".join(f"{name} {card['metrics'][f'test/{name}']:.3g}" for name in names)
+        card = read_card(path)
+        names = get_method(card["settings"]["objective"]).results
+        result = ", ".join(f"{name} {card['metrics'][f'eval/{name}']:.3g}" for name in names)
         size = path.with_suffix(".safetensors").stat().st_size / 1000
         rows.append(
             f"| `{path.parent.name}/{path.stem}` | {card['dataset']['n_transitions']:,} | "

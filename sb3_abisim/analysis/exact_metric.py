@@ -68,7 +68,7 @@ def action_bisim_metric(
 
 
 def behavior_weights(policy: Floats, other_policy: Floats) -> Floats:
-    """The distribution of the common action where two states' actions are drawn from behavior policies and agree.
+    """The distribution of the common action where two states' actions are sampled from behavior policies and agree.
 
     This is what pairs of recorded transitions that took the same action follow.
 

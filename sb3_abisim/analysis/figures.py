@@ -1,4 +1,4 @@
-"""The table of figures: how each is computed and drawn, and how it is made from encoder names."""
+"""The table of figures: how each is computed and plotted, and how it is made from encoder names."""
 
 import json
 import math
@@ -8,23 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
-from sb3_abisim.analysis import curves, leak, perturbation, pixels, plots, plots_pixels, probes, sweep
-from sb3_abisim.analysis import neighbors as neighbors
+from sb3_abisim.analysis import curves, leak, neighbors, perturbation, pixels, plots, plots_pixels, probes, sweep
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.data.collect import make_vector_env
 from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
-
-NAV2D_IDS = ("Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0")
-SHIPPED_IDS = ("Nav2D-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "DistractorPointMaze-v0")
-ALL_IDS = ("DistractorPointMaze-v0", *(key for key in ENV_IDS if key != "DistractorPointMaze-v0"))
-# Environments without shipped encoders that show the pictures of one that has some.
-SAME_PICTURES = {"Nav2DCorridor-v0": "Nav2D-v0", "Nav2DMaze-v0": "Nav2D-v0"}
+from sb3_abisim.registry import get_traits
 
 Compute = Callable[[dict[str, EncoderFile], str, int], dict[str, Any]]
-Draw = Callable[[dict[str, Any], Path], None]
+Plot = Callable[[dict[str, Any], Path], None]
 
 
 @dataclass(frozen=True)
@@ -32,72 +24,72 @@ class Figure:
     """One figure.
 
     :param help: what it shows, in a line
-    :param env_ids: where it can be made, the default first
-    :param usual_ids: where ``all`` makes it
+    :param env_ids: where ``all`` makes it, the default first; it can be made wherever ``compute`` does not refuse
     :param size: default of the number that ``compute`` takes last
     :param unit: what that number counts
     :param compute: from encoders by name, environment id and size to the numbers
-    :param draw: from the numbers to the PNG
-    :param trained: whether encoders of one's own folder join the shipped ones by default
+    :param plot: from the numbers to the PNG
+    :param trained: whether encoders of a custom folder join the shipped ones by default
     :param encoders: whether it looks at encoders at all
     """
 
     help: str
     env_ids: tuple[str, ...]
-    usual_ids: tuple[str, ...]
     size: int
     unit: str
     compute: Compute
-    draw: Draw
+    plot: Plot
     trained: bool = False
     encoders: bool = True
 
 
 FIGURES = {
     "perturbation": Figure(
-        "perturbation maps on Nav2D: single-step against multi-step", NAV2D_IDS, NAV2D_IDS[:1], 10,
-        "layouts, four seconds each", perturbation.nav2d_maps, plots.draw_maps,
+        "perturbation maps on Nav2D: single-step and multi-step", ("Nav2D-v0",), 10, "layouts, four seconds each",
+        perturbation.nav2d_maps, plots.plot_maps,
     ),
     "near-far": Figure(
-        "violins of near and far obstacles on Nav2D, with the regions", NAV2D_IDS[:1], NAV2D_IDS[:1], 1000,
-        "layouts", perturbation.near_and_far, plots.draw_near_and_far,
+        "violins of near and far obstacles on Nav2D, with the regions", ("Nav2D-v0",), 1000, "layouts",
+        perturbation.near_and_far, plots.plot_near_and_far,
     ),
     "structures": Figure(
-        "sensitivity within and beyond the reachable part of corridor and maze", NAV2D_IDS[1:], NAV2D_IDS[1:], 8,
-        "layouts", perturbation.structure_maps, plots.draw_structures, trained=True,
+        "sensitivity within and beyond the reachable part of corridor and maze",
+        ("Nav2DCorridor-v0", "Nav2DMaze-v0"), 8, "layouts", perturbation.structure_maps, plots.plot_structures,
+        trained=True,
     ),
     "pixels": Figure(
-        "perturbation maps of the point mazes: an obstacle moved, the clip swapped", pixels.ENV_IDS,
-        ("PointMaze-v0", "DistractorPointMaze-v0"), 1500, "states", pixels.pixel_maps, plots_pixels.draw_pixel_maps,
+        "perturbation maps of the point mazes: an obstacle moved, the clip swapped",
+        ("PointMaze-v0", "DistractorPointMaze-v0"), 1500, "states", pixels.pixel_maps, plots_pixels.plot_pixel_maps,
     ),
     "neighbors": Figure(
-        "nearest neighbors in embedding space", ALL_IDS, ALL_IDS[:1], 500, "episodes", neighbors.neighbors,
-        plots_pixels.draw_neighbors,
+        "nearest neighbors in embedding space", ("DistractorPointMaze-v0",), 500, "episodes", neighbors.neighbors,
+        plots_pixels.plot_neighbors,
     ),
     "probes": Figure(
-        "what probes read from embeddings, and the distractor-invariance ratio", ALL_IDS,
+        "what probes read from embeddings, and the distractor-invariance ratio",
         ("DistractorPointMaze-v0", "PointMaze-v0", "Nav2D-v0"), 300, "episodes to learn from", probes.probes,
-        plots_pixels.draw_probes, trained=True,
+        plots_pixels.plot_probes, trained=True,
     ),
     "curves": Figure(
-        "pretraining curves, from the cards", ALL_IDS, SHIPPED_IDS, 1, "unused",
-        lambda files, env_id, size: curves.curves(files), plots_pixels.draw_curves,
+        "pretraining curves, from the model cards",
+        ("DistractorPointMaze-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "Nav2D-v0"), 1, "unused",
+        lambda files, env_id, size: curves.curves(files), plots_pixels.plot_curves,
     ),
     "leak": Figure(
-        "can the action be read from a few pixels?", ALL_IDS, ("DistractorPointMaze-v0", "Nav2D-v0"), 300, "episodes",
-        lambda files, env_id, size: leak.leak_maps(env_id, size), plots_pixels.draw_leak, encoders=False,
+        "can the action be read from a few pixels?", ("DistractorPointMaze-v0", "Nav2D-v0"), 300, "episodes",
+        lambda files, env_id, size: leak.leak_maps(env_id, size), plots_pixels.plot_leak, encoders=False,
     ),
 }  # fmt: skip
 
 
 def default_encoders(env_id: str, trained: Path | None = None) -> list[str]:
-    """All encoders that ship for an environment, and those of one's own folder, copies of shipped ones left out.
+    """All encoders that ship for an environment, and those of a custom folder, copies of shipped ones left out.
 
-    :param env_id: a registered id of ours
+    :param env_id: a registered id
     :param trained: holds ``<env_id>/*.safetensors``; None for the shipped ones alone
     :raises ValueError: if there is none
     """
-    shipped = resource_path("encoders") / SAME_PICTURES.get(env_id, env_id)
+    shipped = resource_path("encoders") / (get_traits(env_id).same_observations_as or env_id)
     names = [f"{path.parent.name}/{path.stem}" for path in sorted(shipped.glob("*.safetensors"), reverse=True)]
     if trained is not None:
         there = {load_encoder(name).hash for name in names}
@@ -112,22 +104,23 @@ def load_all(names: list[str], env_id: str) -> dict[str, EncoderFile]:
     """Encoders by name, checked against the environment's observations.
 
     :param names: files or names
-    :param env_id: a registered id of ours
-    :raises ValueError: for encoders of other observations
+    :param env_id: a registered id
+    :raises ValueError: for an unknown id, or encoders of other observations
     """
-    space = gym.make(env_id).observation_space
+    env = make_vector_env(env_id, 1, {})
     files = {name: load_encoder(name) for name in names}
     for file in files.values():
-        file.check(space)
+        file.check(env.single_observation_space)
+    env.close()
     return files
 
 
 def make_figure(name: str, files: dict[str, EncoderFile], env_id: str, size: int, images: Path, numbers: Path) -> Path:
-    """Compute a figure; write its numbers and then the picture.
+    """Compute a figure; write its numbers, then the PNG.
 
     :param name: a key of :data:`FIGURES`
     :param files: encoders by name
-    :param env_id: one of the figure's
+    :param env_id: a registered id
     :param size: see :class:`Figure`, at least 1
     :param images: folder for ``<name>-<env_id>.png``
     :param numbers: folder for ``<name>-<env_id>.json``
@@ -140,7 +133,7 @@ def make_figure(name: str, files: dict[str, EncoderFile], env_id: str, size: int
     plots.pyplot()
     results = FIGURES[name].compute(files, env_id, size)
     settings = {"figure": name, "env_id": env_id, "size": size, "size_counts": FIGURES[name].unit}
-    return write_figure(settings | results, FIGURES[name].draw, images, numbers)
+    return write_figure(settings | results, FIGURES[name].plot, images, numbers)
 
 
 def make_sweep(
@@ -160,32 +153,33 @@ def make_sweep(
     if size < 1:
         raise ValueError(f"-n must be at least 1, got {size}")
     plots.pyplot()
-    env_id = NAV2D_IDS[0]
+    env_id = FIGURES["perturbation"].env_ids[0]
     (base_file,) = load_all([base], env_id).values()
     files = sweep.sweep_encoders(values, base, folder, data, env_id)
     results = perturbation.sweep_maps(files, base_file.encoder.eval(), env_id, size)
     settings = {"figure": "sweep", "env_id": env_id, "size": size, "base": base, "base_hash": base_file.hash}
-    return write_figure(settings | results, plots.draw_sweep, images, numbers)
+    return write_figure(settings | results, plots.plot_sweep, images, numbers)
 
 
-def write_figure(results: dict[str, Any], draw: Draw, images: Path, numbers: Path) -> Path:
-    """Write a figure's numbers as JSON and draw it.
+def write_figure(results: dict[str, Any], plot: Plot, images: Path, numbers: Path) -> Path:
+    """Write a figure's numbers as JSON and plot it.
 
-    :param results: with ``figure`` and ``env_id``, which name the files
-    :param draw: see :class:`Figure`
+    :param results: with ``figure`` and ``env_id``, which name the files; ``observations`` are plotted only
+    :param plot: see :class:`Figure`
     :param images: folder for the PNG
     :param numbers: folder for the JSON
     """
-    stem = f"{results['figure']}-{results['env_id']}"
-    pictures = {key: value for key, value in results.items() if key == "pictures"}
-    plain = _plain({key: value for key, value in results.items() if key != "pictures"})
+    # Ids may have a namespace, as in my/Toy-v0.
+    stem = f"{results['figure']}-{results['env_id'].replace('/', '-')}"
+    shown = {key: value for key, value in results.items() if key == "observations"}
+    plain = _plain({key: value for key, value in results.items() if key != "observations"})
     text = json.dumps(plain, indent=1, allow_nan=False)
     # Each innermost list on one line: a map has hundreds of numbers.
     text = re.sub(r"\[[^][{}]*\]", lambda found: " ".join(found[0].split()), text) + "\n"
     numbers.mkdir(parents=True, exist_ok=True)
     write_atomic(numbers / f"{stem}.json", lambda file: file.write(text.encode()))
     # From the numbers as they were written, so that the file alone gives the same figure.
-    draw(plain | pictures, images / f"{stem}.png")
+    plot(plain | shown, images / f"{stem}.png")
     return images / f"{stem}.png"
 
 

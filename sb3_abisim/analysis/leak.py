@@ -1,25 +1,28 @@
 """Can the action be read from a few pixels?
 
-An inverse model that finds such pixels need look at nothing else, and its encoder then knows nothing else: the paper's
-example is a small display of the last action. The audit gives each small patch of the picture, before and after the
-step, to a decision tree that predicts the action. A patch through which an agent passes now and then tells little; a
-patch that tells half of what there is to know, by itself, is a leak. The audit looks at data, not at an encoder: it can
-be run before pretraining.
+An inverse model that finds such pixels needs nothing else, and its encoder then knows nothing else: the paper's
+example is a small display of the last action. The audit gives each small patch of the observation, before and after
+the step, to a decision tree that predicts the action. A patch through which an agent passes now and then predicts
+little. A patch that by itself predicts half of what can be predicted is a leak. The audit looks at data, not at an
+encoder: it can be run before pretraining.
 """
 
+import itertools
 import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.scenes import sample_episodes
 
 # A score (0 chance, 1 certainty) from which one patch alone counts as a leak.
 THRESHOLD = 0.5
-# Patches per side of the picture, by its size: each is 1/256 of a point maze or scan, 1/25 of Nav2D.
-N_PATCHES = {15: 5, 64: 16, 128: 16, 256: 16}
+# Per side of the observation: each patch is 1/256 of it, or of a small one 3 x 3 pixels.
+MAX_PATCHES = 16
+MIN_PATCH_PIXELS = 3
 MAX_DEPTH = 8
 PER_EPISODE = 10
 DISPLAY = 2  # pixels of the painted display, per side
@@ -31,11 +34,12 @@ class ActionLeakWarning(UserWarning):
 
 @dataclass(frozen=True)
 class LeakAudit:
-    """What each patch tells about the action.
+    """How well each patch predicts the action.
 
     :param scores: by patch [row, column]: for discrete actions (accuracy - chance) / (1 - chance) with chance the share
-        of the commonest action, for continuous ones the coefficient of determination; on held-out transitions
-    :param patch: (height, width) of a patch in pixels
+        of the commonest action, for continuous ones the coefficient of determination; on transitions that the tree
+        has not learned from
+    :param patch: (height, width) of the largest patch in pixels
     """
 
     scores: NDArray[np.float64]
@@ -43,53 +47,58 @@ class LeakAudit:
 
     @property
     def best(self) -> tuple[int, int]:
-        """Row and column of the patch that tells most."""
+        """Row and column of the patch that predicts most."""
         row, column = np.unravel_index(int(self.scores.argmax()), self.scores.shape)
         return int(row), int(column)
 
     @property
     def leaks(self) -> bool:
-        """Whether one patch alone tells the action."""
+        """Whether one patch alone predicts the action."""
         return bool(self.scores.max() >= THRESHOLD)
 
 
-def audit(
-    frames: NDArray[np.uint8], actions: NDArray[Any], next_frames: NDArray[np.uint8], n_patches: int
-) -> LeakAudit:
-    """Score every patch; warn if one of them tells the action.
+def audit(obs: NDArray[np.uint8], actions: NDArray[Any], next_obs: NDArray[np.uint8]) -> LeakAudit:
+    """Score every patch; warn if one of them predicts the action.
 
-    :param frames: s_t, uint8 (n, channels, height, width)
+    :param obs: s_t, uint8 (n, channels, height, width)
     :param actions: a_t, int (n,) or float (n, action_dim)
-    :param next_frames: s_{t+1}, as ``frames``
-    :param n_patches: per side; must divide height and width
-    :raises ValueError: if it does not, or there are fewer than 10 transitions
+    :param next_obs: s_{t+1}, as ``obs``
+    :raises ValueError: for fewer than 10 transitions
     """
-    n, channels, height, width = frames.shape
-    if height % n_patches or width % n_patches:
-        raise ValueError(f"n_patches must divide {height} and {width}, got {n_patches}")
-    if n < 10:
-        raise ValueError(f"an audit needs at least 10 transitions, got {n}")
-    both = np.concatenate([frames, next_frames], axis=1)
-    patches = both.reshape(n, 2 * channels, n_patches, height // n_patches, n_patches, width // n_patches)
-    patches = patches.transpose(2, 4, 0, 1, 3, 5).reshape(n_patches, n_patches, n, -1)
-    scores = np.array([[_score(patches[i, j], actions) for j in range(n_patches)] for i in range(n_patches)])
-    result = LeakAudit(scores, (height // n_patches, width // n_patches))
+    if len(obs) < 10:
+        raise ValueError(f"an audit needs at least 10 transitions, got {len(obs)}")
+    both = np.concatenate([obs, next_obs], axis=1)
+    rows, columns = (_edges(size) for size in obs.shape[2:])
+    scores = np.array(
+        [
+            [_score(both[:, :, top:bottom, left:right], actions) for left, right in itertools.pairwise(columns)]
+            for top, bottom in itertools.pairwise(rows)
+        ]
+    )
+    result = LeakAudit(scores, (max(np.diff(rows).tolist()), max(np.diff(columns).tolist())))
     if result.leaks:
         row, column = result.best
         warnings.warn(
-            f"rows {row * result.patch[0]} to {(row + 1) * result.patch[0] - 1}, columns {column * result.patch[1]} to "
-            f"{(column + 1) * result.patch[1] - 1} of the picture alone tell the action (score "
-            f"{scores.max():.2f} of 1): an inverse model may learn to look at nothing else; mask these pixels",
+            f"rows {rows[row]} to {rows[row + 1] - 1}, columns {columns[column]} to {columns[column + 1] - 1} of the "
+            f"observation alone predict the action (score {scores.max():.2f} of 1): an inverse model may learn to look "
+            "at nothing else; mask these pixels",
             ActionLeakWarning,
             stacklevel=2,
         )
     return result
 
 
+def _edges(size: int) -> list[int]:
+    """Where the patches of a side begin, and where the last one ends."""
+    n_patches = min(MAX_PATCHES, max(1, size // MIN_PATCH_PIXELS))
+    return [size * k // n_patches for k in range(n_patches + 1)]
+
+
 def _score(pixels: NDArray[np.uint8], actions: NDArray[Any]) -> float:
     """How well a tree that has learned on the first two thirds predicts the rest."""
     from sklearn.tree import DecisionTreeClassifier, DecisionTreeRegressor
 
+    pixels = pixels.reshape(len(pixels), -1)
     split = 2 * len(pixels) // 3
     # A patch in which nothing ever happens is a tree with a single leaf; this only saves time.
     if (pixels == pixels[0]).all():
@@ -97,7 +106,7 @@ def _score(pixels: NDArray[np.uint8], actions: NDArray[Any]) -> float:
     if actions.ndim == 1:
         tree = DecisionTreeClassifier(max_depth=MAX_DEPTH, min_samples_leaf=5, random_state=0)
         tree.fit(pixels[:split], actions[:split])
-        chance = np.bincount(actions[split:]).max() / (len(actions) - split)
+        chance = np.unique(actions[split:], return_counts=True)[1].max() / (len(actions) - split)
         return float((tree.score(pixels[split:], actions[split:]) - chance) / max(1 - chance, 1e-9))
     # The largest over the action's dimensions: a display of one of them is a leak.
     scores = []
@@ -107,14 +116,14 @@ def _score(pixels: NDArray[np.uint8], actions: NDArray[Any]) -> float:
     return float(max(scores))
 
 
-def paint_action(next_frames: NDArray[np.uint8], actions: NDArray[Any]) -> NDArray[np.uint8]:
+def paint_action(next_obs: NDArray[np.uint8], actions: NDArray[Any]) -> NDArray[np.uint8]:
     """The paper's example: a display of the last action in the top left corner of s_{t+1}, as gray levels.
 
-    :param next_frames: uint8 (n, channels, height, width)
+    :param next_obs: uint8 (n, channels, height, width)
     :param actions: int (n,), or float (n, action_dim) in -1..1, of which the first two channels show the first two
     :return: a copy
     """
-    painted = next_frames.copy()
+    painted = next_obs.copy()
     if actions.ndim == 1:
         painted[:, :, :DISPLAY, :DISPLAY] = (60 * actions)[:, None, None, None]
     else:
@@ -126,17 +135,18 @@ def paint_action(next_frames: NDArray[np.uint8], actions: NDArray[Any]) -> NDArr
 def leak_maps(env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
     """Audit an environment as it is and, to show that the audit finds a leak, with the paper's display painted in.
 
-    :param env_id: a registered id of ours
+    :param env_id: a registered id
     :param n_episodes: of random play, :data:`PER_EPISODE` transitions of each
     :param seed: of the episodes
     """
     samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed)
-    n_patches = N_PATCHES[samples.frames.shape[-1]]
-    plain = audit(samples.frames, samples.actions, samples.next_frames, n_patches)
+    space, shown = samples.env.single_action_space, samples.actions
+    if isinstance(space, Box):
+        shown = 2 * (shown - space.low) / (space.high - space.low) - 1
+    plain = audit(samples.obs, samples.actions, samples.next_obs)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ActionLeakWarning)
-        painted = paint_action(samples.next_frames, samples.actions)
-        display = audit(samples.frames, samples.actions, painted, n_patches)
+        display = audit(samples.obs, samples.actions, paint_action(samples.next_obs, shown))
     audits = {"as it is": plain, "with a display of the action": display}
     return {
         "n_transitions": len(samples),

@@ -1,9 +1,10 @@
 """A learned distance on Nav2D beside the exact one.
 
-A perturbation map answers: by how much does the distance between two states grow when one cell of the grid is toggled
-(an obstacle added or removed) and the agent stands where it stood? The learned answer is the L1 distance of the two
-embeddings; the exact one is the fixed point of the action-bisimulation metric whose base distance is that of the base
-encoder (:mod:`sb3_abisim.analysis.exact_metric`). Both are averaged over layouts and agents by the offset from agent to cell.
+A perturbation map shows by how much the distance between two states grows when one cell of the grid is toggled (an
+obstacle added or removed) and the agent stays where it is. The learned distance is the L1 distance of the two
+embeddings. The exact one is the fixed point of the action-bisimulation metric whose base distance is that of the base
+encoder (:mod:`sb3_abisim.analysis.exact_metric`). Both are averaged over layouts and agents by the offset from agent to
+cell.
 
 The goal counts as any other cell here: the metric knows no reward, and random play passes over it.
 """
@@ -19,18 +20,19 @@ from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import preprocess_obs
 
 from sb3_abisim.analysis.exact_metric import action_bisim_metric
-from sb3_abisim.envs.nav2d import CHANNELS, GOAL, SIZE, next_cells
+from sb3_abisim.common.grids import flood_fill, pack, unpack
+from sb3_abisim.envs.base import batch_class
+from sb3_abisim.envs.nav2d import CHANNELS, GOAL, SIZE, Nav2DVectorEnv, next_cells
 from sb3_abisim.networks.base import Encoder
 
 N_CELLS = SIZE * SIZE
 GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
-ENV_IDS = ("Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0")
 # Bins of the city-block distance from agent to cell, both ends included.
 BINS = ((1, 1), (2, 2), (3, 3), (4, 4), (5, 6), (7, 9), (10, 2 * (SIZE - 1)))
 # Far offsets that few agents see are noise.
 MIN_SAMPLES = 20
 # Far from the seeds that people type, and from those that a dataset's copies get of its seed.
-HELD_OUT_SEED = 1_000_000
+EVAL_SEED = 1_000_000
 TOLERANCE = 1e-3
 EMBED_BATCH = 2048
 
@@ -61,20 +63,30 @@ class Comparison:
     profile_error: float
 
 
-def held_out_layouts(env_id: str, n_layouts: int, seed: int = HELD_OUT_SEED) -> NDArray[np.bool_]:
-    """Obstacles of fresh episodes.
+def check_nav2d(env_id: str) -> None:
+    """Refuse environments whose cells cannot be toggled.
 
-    :param env_id: one of :data:`ENV_IDS`
+    :param env_id: an id of Nav2D, that is of :class:`~sb3_abisim.envs.nav2d.Nav2DVectorEnv` or a subclass
+    :raises ValueError: for any other
+    """
+    found = batch_class(env_id)
+    if found is None or not issubclass(found, Nav2DVectorEnv):
+        raise ValueError(f"cells can be toggled in Nav2D alone, got {env_id!r}; give an id of it such as Nav2D-v0")
+
+
+def eval_layouts(env_id: str, n_layouts: int, seed: int = EVAL_SEED) -> NDArray[np.bool_]:
+    """Obstacles of new episodes.
+
+    :param env_id: an id of Nav2D
     :param n_layouts: how many
     :param seed: of the first episode; the next has the next seed
     :return: (n_layouts, SIZE * SIZE)
     :raises ValueError: for another environment
     """
-    if env_id not in ENV_IDS:
-        raise ValueError(f"the exact metric is computed for {', '.join(ENV_IDS)}, got {env_id!r}")
+    check_nav2d(env_id)
     env = gym.make(env_id)
-    pictures = np.array([env.reset(seed=seed + k)[0] for k in range(n_layouts)])
-    obstacles: NDArray[np.bool_] = pictures[:, CHANNELS.index("obstacles")].reshape(n_layouts, N_CELLS) > 0
+    shown = np.array([env.reset(seed=seed + k)[0] for k in range(n_layouts)])
+    obstacles: NDArray[np.bool_] = shown[:, CHANNELS.index("obstacles")].reshape(n_layouts, N_CELLS) > 0
     return obstacles
 
 
@@ -83,41 +95,38 @@ def reachable(obstacles: NDArray[np.bool_]) -> NDArray[np.int64]:
 
     :param obstacles: (SIZE * SIZE,)
     """
-    nexts = next_cells(obstacles)
-    reached = np.zeros(N_CELLS, dtype=bool)
-    front = np.array([GOAL_CELL])
-    while len(front):
-        reached[front] = True
-        front = np.unique(nexts[front])
-        front = front[~reached[front]]
-    return np.flatnonzero(reached)
+    # One column more, which is never free.
+    free = np.pad(~obstacles.reshape(SIZE, SIZE), ((0, 0), (0, 1)))
+    goal = 1 << (GOAL[1] * (SIZE + 1) + GOAL[0])
+    reached = flood_fill(goal, pack(free), SIZE + 1)
+    return np.flatnonzero(unpack(reached, SIZE, SIZE + 1)[:, :SIZE])
 
 
-def pictures(obstacles: NDArray[np.bool_], agents: NDArray[np.int64]) -> NDArray[np.uint8]:
+def observations(obstacles: NDArray[np.bool_], agents: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Observations of a layout with the agent in each of some cells.
 
     :param obstacles: (SIZE * SIZE,)
     :param agents: cell indices, (n,)
     :return: (n, 3, SIZE, SIZE)
     """
-    frames = np.zeros((len(agents), len(CHANNELS), N_CELLS), dtype=np.uint8)
-    frames[:, CHANNELS.index("obstacles")] = np.where(obstacles, 255, 0)
-    frames[:, CHANNELS.index("goal"), GOAL_CELL] = 255
-    frames[np.arange(len(agents)), CHANNELS.index("agent"), agents] = 255
-    return frames.reshape(len(agents), len(CHANNELS), SIZE, SIZE)
+    shown = np.zeros((len(agents), len(CHANNELS), N_CELLS), dtype=np.uint8)
+    shown[:, CHANNELS.index("obstacles")] = np.where(obstacles, 255, 0)
+    shown[:, CHANNELS.index("goal"), GOAL_CELL] = 255
+    shown[np.arange(len(agents)), CHANNELS.index("agent"), agents] = 255
+    return shown.reshape(len(agents), len(CHANNELS), SIZE, SIZE)
 
 
 @th.no_grad()
-def embed(encoder: Encoder, frames: NDArray[np.uint8]) -> th.Tensor:
-    """Embeddings of frames through SB3's preprocessing, (n, features_dim).
+def embed(encoder: Encoder, observations: NDArray[np.uint8]) -> th.Tensor:
+    """Embeddings through SB3's preprocessing, (n, features_dim).
 
     :param encoder: in evaluation mode
-    :param frames: (n, channels, height, width)
+    :param observations: (n, channels, height, width)
     """
-    space = gym.spaces.Box(0, 255, frames.shape[1:], np.uint8)
+    space = gym.spaces.Box(0, 255, observations.shape[1:], np.uint8)
     parts = []
-    # Floats of 64 x 64 pictures take 49 kB each.
-    for part in th.split(th.as_tensor(frames), EMBED_BATCH):
+    # Floats of a 64 x 64 observation take 49 kB.
+    for part in th.split(th.as_tensor(observations), EMBED_BATCH):
         inputs = preprocess_obs(part, space)
         assert isinstance(inputs, th.Tensor)
         parts.append(encoder(inputs))
@@ -134,7 +143,7 @@ def states(base: Encoder, obstacles: NDArray[np.bool_]) -> tuple[NDArray[np.int6
     """
     free = np.flatnonzero(~obstacles)
     nexts = np.searchsorted(free, next_cells(obstacles)[free])
-    return free, nexts, embed(base, pictures(obstacles, free))
+    return free, nexts, embed(base, observations(obstacles, free))
 
 
 def learned_maps(encoder: Encoder, layouts: NDArray[np.bool_]) -> Maps:
@@ -147,10 +156,10 @@ def learned_maps(encoder: Encoder, layouts: NDArray[np.bool_]) -> Maps:
     maps = np.full((len(layouts), N_CELLS, N_CELLS), np.nan)
     for k, obstacles in enumerate(layouts):
         agents = reachable(obstacles)
-        features = embed(encoder, pictures(obstacles, agents))
+        features = embed(encoder, observations(obstacles, agents))
         for cell in _togglable():
             stay = agents != cell
-            other = embed(encoder, pictures(_toggled(obstacles, cell), agents[stay]))
+            other = embed(encoder, observations(_toggled(obstacles, cell), agents[stay]))
             maps[k, agents[stay], cell] = (features[th.as_tensor(stay)] - other).abs().sum(dim=1).numpy()
     return maps
 
@@ -219,20 +228,20 @@ class ExactReference:
 
     :param base: the base encoder, in evaluation mode
     :param c: weight of the recursive term
-    :param env_id: one of :data:`ENV_IDS`
+    :param env_id: an id of Nav2D
     :param n_layouts: layouts to average over, about six seconds each
-    :param seed: see :func:`held_out_layouts`
+    :param seed: see :func:`eval_layouts`
     """
 
     def __init__(
-        self, base: Encoder, c: float, env_id: str = "Nav2D-v0", n_layouts: int = 10, seed: int = HELD_OUT_SEED
+        self, base: Encoder, c: float, env_id: str = "Nav2D-v0", n_layouts: int = 10, seed: int = EVAL_SEED
     ) -> None:
-        self.layouts = held_out_layouts(env_id, n_layouts, seed)
+        self.layouts = eval_layouts(env_id, n_layouts, seed)
         self.maps = exact_maps(base, self.layouts, c)
         self._distances = [exact_distances(base, obstacles, c) for obstacles in self.layouts]
 
     def compare(self, encoder: Encoder) -> Comparison:
-        """Hold an encoder against the exact metric.
+        """Compare an encoder with the exact metric.
 
         :param encoder: any encoder of Nav2D, in evaluation mode
         """
@@ -242,7 +251,7 @@ class ExactReference:
         seen = ~np.isnan(learned) & ~np.isnan(exact)
         states = []
         for obstacles, distances in zip(self.layouts, self._distances, strict=True):
-            features = embed(encoder, pictures(obstacles, reachable(obstacles)))
+            features = embed(encoder, observations(obstacles, reachable(obstacles)))
             pairs = np.triu_indices(len(distances), k=1)
             states.append(spearman(th.cdist(features, features, p=1.0).numpy()[pairs], distances[pairs]))
         here, there = profile(maps), profile(self.maps)

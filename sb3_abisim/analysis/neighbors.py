@@ -1,8 +1,9 @@
 """Nearest neighbors in embedding space: what do states that an encoder takes for alike have in common?
 
 A state's neighbor is the nearest state (L1 distance of embeddings) of any other episode, so in another layout. If the
-encoder follows the agent, neighbors have it in like places; if it follows obstacles, neighbors have like
-surroundings; if it follows the background, neighbors share their clip. Each is held against random pairs of states.
+encoder follows the agent, neighbors have it in like places. If it follows obstacles, neighbors have like surroundings.
+If it follows the background, neighbors share their clip. Each is compared with random pairs of states. Of environments
+whose agent and obstacles are not known, the observations of neighbors are shown.
 """
 
 from typing import Any
@@ -12,49 +13,48 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
-from sb3_abisim.analysis.pixels import clip_settings
-from sb3_abisim.analysis.scenes import Samples, local_obstacles, position_in_picture, sample_episodes
+from sb3_abisim.analysis.scenes import Samples, agent_positions, eval_settings, local_obstacles, sample_episodes
 from sb3_abisim.networks.encoder_file import EncoderFile
 
 PER_EPISODE = 10
-N_PICTURED = 4
+N_SHOWN = 4
 
 
 def neighbors(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
-    """Nearest neighbors among states of held-out layouts, by setting (:func:`clip_settings`).
+    """Nearest neighbors among states of new episodes, by setting (:func:`eval_settings`).
 
     :param files: encoders by name
-    :param env_id: a registered id of ours
+    :param env_id: a registered id
     :param n_episodes: :data:`PER_EPISODE` states of each make up the pool, and every one of them is a query
     :param seed: of the episodes
     :return: ``settings``: per encoder and for random pairs ``agent`` (mean distance of the two agents, in cells or
-        meters), ``obstacles`` (correlation of the surroundings, :func:`similarity`), ``same_clip`` (share; None without
-        clips), and ``examples`` of a few queries; ``pictures``, not for JSON: by setting, the queries' and each
-        encoder's neighbors'
+        meters), ``obstacles`` (correlation of the surroundings, :func:`similarity`), ``same_clip`` (share), each None
+        where the environment does not say, and ``examples`` of a few queries; ``observations``, not for JSON: by
+        setting, the queries' and each encoder's neighbors'
     """
-    settings, pictures = {}, {}
-    for setting, env_kwargs in clip_settings(env_id).items():
+    settings, observations = {}, {}
+    for setting, env_kwargs in eval_settings(env_id).items():
         samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, env_kwargs)
-        settings[setting], pictures[setting] = _setting(files, samples, seed)
+        settings[setting], observations[setting] = _setting(files, samples, seed)
     hashes = {name: file.hash for name, file in files.items()}
-    return {"per_episode": PER_EPISODE, "digests": hashes, "settings": settings, "pictures": pictures}
+    return {"per_episode": PER_EPISODE, "hashes": hashes, "settings": settings, "observations": observations}
 
 
 def _setting(
     files: dict[str, EncoderFile], samples: Samples, seed: int
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.uint8]]]:
     generator = np.random.default_rng(seed)
-    queries = generator.choice(len(samples), N_PICTURED, replace=False)
+    queries = generator.choice(len(samples), N_SHOWN, replace=False)
     numbers: dict[str, Any] = {}
-    pictures = {"query": samples.frames[queries]}
+    observations = {"query": samples.obs[queries]}
     for name, file in files.items():
-        nearest, distances = nearest_elsewhere(embed(file.encoder.eval(), samples.frames), samples.episodes)
+        nearest, distances = nearest_elsewhere(embed(file.encoder.eval(), samples.obs), samples.episodes)
         examples = _pair_numbers(samples, queries, nearest[queries])
         examples["distance"] = _relative(distances)[queries].tolist()
         numbers[name] = {**similarity(samples, nearest), "examples": examples}
-        pictures[name] = samples.frames[nearest[queries]]
+        observations[name] = samples.obs[nearest[queries]]
     numbers["random pairs"] = similarity(samples, _random_elsewhere(samples.episodes, generator))
-    return numbers, pictures
+    return numbers, observations
 
 
 def _relative(distances: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -85,33 +85,30 @@ def nearest_elsewhere(
     return th.cat(nearest).numpy(), th.cat(distances).numpy()
 
 
-def similarity(samples: Samples, partners: NDArray[np.int64]) -> dict[str, Any]:
+def similarity(samples: Samples, partners: NDArray[np.int64]) -> dict[str, float | None]:
     """What samples and their partners have in common, mean over samples.
 
-    :param samples: with factors
+    :param samples: of any environment
     :param partners: index of each sample's partner, (n,)
     :return: ``agent``, ``obstacles``, ``same_clip`` as in :func:`neighbors`; the surroundings are correlated as 24
         numbers 0 or 1 each less their mean over all samples, so that 0 is what chance gives
     """
-    everyone = np.arange(len(samples))
-    pairs = _pair_numbers(samples, everyone, partners)
-    blocked = local_obstacles(samples.factors).astype(np.float64)
-    blocked -= blocked.mean(axis=0)
-    correlation = (blocked * blocked[partners]).sum() / (blocked**2).sum()
-    return {
-        "agent": float(np.mean(pairs["agent"])),
-        "obstacles": float(correlation),
-        "same_clip": None if pairs["same_clip"] is None else float(np.mean(pairs["same_clip"])),
-    }
+    pairs = _pair_numbers(samples, np.arange(len(samples)), partners)
+    means = {name: None if values is None else float(np.mean(values)) for name, values in pairs.items()}
+    surroundings = local_obstacles(samples)
+    if surroundings is not None:
+        blocked = surroundings.astype(np.float64)
+        blocked -= blocked.mean(axis=0)
+        means["obstacles"] = float((blocked * blocked[partners]).sum() / (blocked**2).sum())
+    return means
 
 
 def _pair_numbers(samples: Samples, first: NDArray[np.int64], second: NDArray[np.int64]) -> dict[str, Any]:
-    agents = position_in_picture(samples.factors)
-    blocked = local_obstacles(samples.factors)
+    agents, blocked = agent_positions(samples), local_obstacles(samples)
     clips = samples.factors.get("clip_id")
     return {
-        "agent": np.linalg.norm(agents[first] - agents[second], axis=1).tolist(),
-        "obstacles": (blocked[first] == blocked[second]).mean(axis=1).tolist(),
+        "agent": None if agents is None else np.linalg.norm(agents[first] - agents[second], axis=1).tolist(),
+        "obstacles": None if blocked is None else (blocked[first] == blocked[second]).mean(axis=1).tolist(),
         "same_clip": None if clips is None else (clips[first] == clips[second]).tolist(),
     }
 

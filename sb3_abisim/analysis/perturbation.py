@@ -1,4 +1,4 @@
-"""How much an embedding changes when the picture does, on Nav2D: perturbation maps, near against far, fixed structures.
+"""How much an embedding changes with the observation, on Nav2D: perturbation maps, near and far, fixed structures.
 
 Maps toggle single cells, as in :mod:`sb3_abisim.analysis.nav2d_exact`. The violins add whole 2 x 2 blocks, the
 obstacles that the environment has. All changes of an embedding are L1 distances.
@@ -17,23 +17,23 @@ from sb3_abisim.analysis.nav2d_exact import (
     N_CELLS,
     Maps,
     embed,
+    eval_layouts,
     exact_maps,
-    held_out_layouts,
     learned_maps,
     mean_map,
-    pictures,
+    observations,
     profile,
     reachable,
 )
+from sb3_abisim.data.collect import make_vector_env
 from sb3_abisim.envs.nav2d import LAYOUTS, OBSTACLE_SIZE, SIZE
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import EncoderFile
 
 # Regions of the violins by the larger of the two coordinate distances from the agent, in cells. The paper shows a
-# picture of its regions and no numbers.
+# figure of its regions and no numbers.
 NEAR = 2
 FAR = 5
-STRUCTURE_IDS = {"Nav2DCorridor-v0": "corridor", "Nav2DMaze-v0": "maze"}
 KINDS = {".": "reachable", "#": "walls", "?": "out of reach"}
 # Bins with fewer toggled cells of a kind than this say nothing.
 MIN_PAIRS = 100
@@ -53,10 +53,10 @@ def nav2d_maps(files: dict[str, EncoderFile], env_id: str, n_layouts: int) -> di
     """Mean perturbation maps and their profiles by distance.
 
     :param files: encoders by name
-    :param env_id: one of the Nav2D environments
-    :param n_layouts: held-out layouts to average over
+    :param env_id: an id of Nav2D
+    :param n_layouts: eval layouts to average over
     """
-    layouts = held_out_layouts(env_id, n_layouts)
+    layouts = eval_layouts(env_id, n_layouts)
     return {"bins": BINS, "encoders": {name: _map(file, layouts) for name, file in files.items()}}
 
 
@@ -65,10 +65,10 @@ def sweep_maps(files: dict[float, EncoderFile], base: Encoder, env_id: str, n_la
 
     :param files: encoders by c
     :param base: the single-step encoder of all of them
-    :param env_id: one of the Nav2D environments
-    :param n_layouts: held-out layouts to average over
+    :param env_id: an id of Nav2D
+    :param n_layouts: eval layouts to average over
     """
-    layouts = held_out_layouts(env_id, n_layouts)
+    layouts = eval_layouts(env_id, n_layouts)
     encoders = {}
     for c, file in files.items():
         exact = exact_maps(base, layouts, c)
@@ -85,19 +85,20 @@ def _map(file: EncoderFile, layouts: NDArray[np.bool_]) -> dict[str, Any]:
 def structure_maps(files: dict[str, EncoderFile], env_id: str, n_layouts: int) -> dict[str, Any]:
     """Sensitivity to each cell of a fixed structure, mean over layouts and all places that the agent can be in.
 
-    Distance from the agent is told apart from reach: ``profiles`` compare cells of each kind at like distances.
+    Distance from the agent is separated from reach: ``profiles`` compare cells of each kind at like distances.
 
     :param files: encoders by name
-    :param env_id: a key of :data:`STRUCTURE_IDS`
-    :param n_layouts: held-out layouts to average over
+    :param env_id: an id of Nav2D with a fixed layout
+    :param n_layouts: eval layouts to average over
     :return: per encoder ``cells``, (15, 15), ``kinds`` (mean by kind of cell, relative to reachable cells) and
         ``profiles`` (mean by kind and distance, relative to reachable neighbors)
     :raises ValueError: for an environment without fixed structure
     """
-    if env_id not in STRUCTURE_IDS:
-        raise ValueError(f"fixed structures are those of {', '.join(STRUCTURE_IDS)}, got {env_id!r}")
-    layouts = held_out_layouts(env_id, n_layouts)
-    structure = np.array([list(row) for row in LAYOUTS[STRUCTURE_IDS[env_id]]]).ravel()
+    layouts = eval_layouts(env_id, n_layouts)
+    layout = make_vector_env(env_id, 1, {}).unwrapped.layout  # type: ignore[attr-defined]
+    if layout not in LAYOUTS:
+        raise ValueError(f"{env_id} has no fixed structure; give an id of Nav2D with layout={' or '.join(LAYOUTS)}")
+    structure = np.array([list(row) for row in LAYOUTS[layout]]).ravel()
     encoders = {}
     for name, file in files.items():
         maps = learned_maps(file.encoder.eval(), layouts)
@@ -115,7 +116,7 @@ def structure_maps(files: dict[str, EncoderFile], env_id: str, n_layouts: int) -
             "kinds": {label: float(np.nanmean(means[structure == kind]) / reference) for kind, label in KINDS.items()},
             "profiles": {label: (values / nearest).tolist() for label, values in profiles.items()},
         }
-    return {"bins": BINS, "structure": list(LAYOUTS[STRUCTURE_IDS[env_id]]), "encoders": encoders}
+    return {"bins": BINS, "structure": list(LAYOUTS[layout]), "encoders": encoders}
 
 
 def _kind_profile(maps: Maps, cells: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -132,8 +133,8 @@ def near_and_far(files: dict[str, EncoderFile], env_id: str, n_samples: int, see
     """Changes of the embedding when a 2 x 2 obstacle appears near the agent, or far from it.
 
     :param files: encoders by name
-    :param env_id: one of the Nav2D environments
-    :param n_samples: agents, each in a layout of its own; every one sees one near and one far obstacle
+    :param env_id: an id of Nav2D
+    :param n_samples: agents, each in a separate layout; every one sees one near and one far obstacle
     :param seed: of the choices
     :return: per encoder ``near`` and ``far``, (n_samples,), in units of the mean distance between two states that
         differ in where the agent is; ``near_share``, how often the near change is the larger; and the regions
@@ -145,22 +146,22 @@ def near_and_far(files: dict[str, EncoderFile], env_id: str, n_samples: int, see
     elsewhere: list[NDArray[np.uint8]] = []
     near: list[NDArray[np.uint8]] = []
     far: list[NDArray[np.uint8]] = []
-    for obstacles in held_out_layouts(env_id, n_samples):
+    for obstacles in eval_layouts(env_id, n_samples):
         agents = reachable(obstacles)
         agent, other = generator.choice(agents, size=2, replace=False)
         choices = [_new_blocks(obstacles, agent, inside) for inside in (True, False)]
         if not all(len(blocks) for blocks in choices):
             continue
         changed = [_with_block(obstacles, generator.choice(blocks)) for blocks in choices]
-        before.append(pictures(obstacles, np.array([agent]))[0])
-        elsewhere.append(pictures(obstacles, np.array([other]))[0])
+        before.append(observations(obstacles, np.array([agent]))[0])
+        elsewhere.append(observations(obstacles, np.array([other]))[0])
         for pile, layout in zip((near, far), changed, strict=True):
-            pile.append(pictures(layout, np.array([agent]))[0])
+            pile.append(observations(layout, np.array([agent]))[0])
         if example is None:
             example = {"obstacles": obstacles.reshape(SIZE, SIZE).tolist(), "agent": [int(_X[agent]), int(_Y[agent])]}
     encoders = {}
     for name, file in files.items():
-        features = [embed(file.encoder.eval(), np.array(frames)) for frames in (before, elsewhere, near, far)]
+        features = [embed(file.encoder.eval(), np.array(shown)) for shown in (before, elsewhere, near, far)]
         moved, here, there = ((x - features[0]).abs().sum(dim=1).double() for x in features[1:])
         encoders[name] = {
             "hash": file.hash,

@@ -1,9 +1,8 @@
-"""Perturbations in pixel space: point mazes drawn again from changed simulator states.
+"""Perturbations in pixel space: point mazes rendered again from changed simulator states.
 
-One obstacle is moved by a meter and all else stays: agent, other obstacles and, in Distractor PointMaze, the frame of
-the clip behind them. For comparison the agent is moved by as much, the state is replaced by another one, and (in
-Distractor PointMaze) the clip is swapped under the same state. Clips are those of pretraining and, apart from them,
-unseen ones.
+One obstacle is moved by a meter. All else stays: the agent, the other obstacles and, in Distractor PointMaze, the frame
+of the clip in the background. For comparison the agent is moved by as much, the state is replaced by another one, and
+(in Distractor PointMaze) the clip is swapped under the same state. Train and eval clips are looked at apart.
 """
 
 from typing import Any
@@ -13,16 +12,16 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
-from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, sample_episodes
-from sb3_abisim.envs.backgrounds.clips import SPLITS, Backgrounds
-from sb3_abisim.envs.backgrounds.load import load_backgrounds
-from sb3_abisim.envs.point_maze.env import ROOM_SIZE
+from sb3_abisim.analysis.scenes import Samples, eval_settings, render_point_mazes, sample_episodes
+from sb3_abisim.envs.backgrounds.clips import Backgrounds
+from sb3_abisim.envs.base import batch_class
+from sb3_abisim.envs.point_maze.distractors import DistractorPointMazeVectorEnv
+from sb3_abisim.envs.point_maze.env import ROOM_SIZE, PointMazeVectorEnv
 from sb3_abisim.envs.point_maze.layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METER
 from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import EncoderFile
 
-ENV_IDS = ("PointMaze-v0", "DistractorPointMaze-v0", "ContinuousPointMaze-v0", "ContinuousDistractorPointMaze-v0")
 STEP = 1.0  # m, how far an obstacle or the agent is moved
 # Distances in meters from the agent's center to the nearest edge of the obstacle, before or after the move.
 BINS = ((0.0, 0.6), (0.6, 1.2), (1.2, 2.0), (2.0, 3.0), (3.0, 5.0), (5.0, 15.0))
@@ -32,58 +31,34 @@ MIN_SAMPLES = 5
 _HALF = OBSTACLE_PIXELS / PIXELS_PER_METER / 2
 
 
-def has_clips(env_id: str) -> bool:
-    """Whether the floor of an environment shows clips.
-
-    :param env_id: a registered id of ours
-    """
-    return "Distractor" in env_id
-
-
-def clip_settings(env_id: str) -> dict[str, dict[str, Any]]:
-    """What encoders are looked at on: name to the environment's keyword arguments. Layouts are always held out.
-
-    Scans are not, since there are five of them. Their episodes end by distance: with the action stop, random ones
-    would be over after four steps.
-
-    :param env_id: a registered id of ours
-    """
-    if env_id.startswith("ScanNav"):
-        return {"other episodes": {"stop": "auto"}}
-    if not has_clips(env_id):
-        return {"held-out layouts": {}}
-    return {"clips of pretraining": {"split": "train", "color_jitter": False}, "unseen clips": {"split": "eval"}}
-
-
-def clips_of(samples: Samples) -> Backgrounds | None:
-    """The built-in clips that samples were drawn from; None for environments without.
-
-    :param samples: with factors
-    """
-    if "clip_id" not in samples.factors:
-        return None
-    sides = (load_backgrounds(None, split) for split in SPLITS)
-    (clips,) = (side for side in sides if np.isin(samples.factors["clip_id"], side.clip_ids).all())
-    return clips
-
-
 def backgrounds_of(samples: Samples) -> NDArray[np.uint8] | None:
-    """The clip frames behind samples, uint8 (n, 3, 64, 64); None for environments without clips.
+    """The clip frames in the background, uint8 (n, 3, 64, 64); None for environments without clips.
 
-    :param samples: with factors
+    :param samples: of any environment
     """
     clips = clips_of(samples)
     return None if clips is None else clips.frames(samples.factors["clip"], samples.factors["frame"])
 
 
+def clips_of(samples: Samples) -> Backgrounds | None:
+    """The clips that an environment shows; None for environments without.
+
+    :param samples: of any environment
+    """
+    return samples.env.backgrounds if isinstance(samples.env, DistractorPointMazeVectorEnv) else None
+
+
 def swapped_backgrounds(samples: Samples, generator: np.random.Generator) -> NDArray[np.uint8]:
-    """Frames of another clip of the same side for each sample, uint8 (n, 3, 64, 64).
+    """Frames of another clip of the same split for each sample, uint8 (n, 3, 64, 64).
 
     :param samples: of an environment with clips
-    :param generator: draws clip and frame
+    :param generator: samples clip and frame
+    :raises ValueError: if the split has one clip only
     """
     clips = clips_of(samples)
     assert clips is not None
+    if clips.n_clips < 2:
+        raise ValueError(f"{clips.source} has one clip in the split {clips.split!r}; give a second one to swap it with")
     clip = (samples.factors["clip"] + generator.integers(1, clips.n_clips, size=len(samples))) % clips.n_clips
     return clips.frames(clip, generator.integers(0, clips.lengths[clip]))
 
@@ -92,20 +67,23 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
     """Mean change of the embedding by where the moved obstacle is, and what other changes do.
 
     :param files: encoders by name
-    :param env_id: one of the point mazes
-    :param n_states: agents, each in a layout of its own
+    :param env_id: an id of a point maze
+    :param n_states: agents, each in a separate layout
     :param seed: of the choices
-    :return: per encoder and setting (:func:`clip_settings`), in units of the mean distance between two states on the
+    :return: per encoder and setting (:func:`eval_settings`), in units of the mean distance between two states on the
         same background: ``map`` by offset [dy, dx] in meters from agent to obstacle, ``profile`` by distance
         (:data:`BINS`), ``agent``, and ``clip`` (None without clips)
-    :raises ValueError: for an environment without pixels of this kind, or too few states
+    :raises ValueError: for another environment, or too few states
     """
-    if env_id not in ENV_IDS:
-        raise ValueError(f"obstacles can be moved in {', '.join(ENV_IDS)}, got {env_id!r}")
+    found = batch_class(env_id)
+    if found is None or not issubclass(found, PointMazeVectorEnv):
+        raise ValueError(
+            f"obstacles can be moved in the point mazes alone, got {env_id!r}; give an id of one such as PointMaze-v0"
+        )
     if n_states < 2:
         raise ValueError(f"distances between states need two states or more, got {n_states}")
     encoders: dict[str, Any] = {name: {"hash": file.hash, "settings": {}} for name, file in files.items()}
-    for setting, env_kwargs in clip_settings(env_id).items():
+    for setting, env_kwargs in eval_settings(env_id).items():
         samples = sample_episodes(env_id, n_states, 1, seed, env_kwargs)
         scenes = _scenes(samples, np.random.default_rng(seed))
         for name, file in files.items():
@@ -114,18 +92,21 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
 
 
 def _scenes(samples: Samples, generator: np.random.Generator) -> dict[str, Any]:
-    """Pictures of the samples and of what was changed in them."""
+    """Observations of the samples and of what was changed in them."""
     agents, obstacles = samples.factors["agent"].astype(np.float64), samples.factors["obstacles"].astype(np.float64)
-    behind = backgrounds_of(samples)
+    backgrounds = backgrounds_of(samples)
     moves = _moves(agents, obstacles, generator)
     index = moves["state"]
     others = np.roll(np.arange(len(samples)), 1)
-    nudged, who = _nudged(agents, obstacles, behind, generator)
-    swapped = None if behind is None else draw_point_mazes(agents, obstacles, swapped_backgrounds(samples, generator))
+    nudged, who = _nudged(agents, obstacles, backgrounds, generator)
+    swapped = None
+    if backgrounds is not None:
+        swapped = render_point_mazes(agents, obstacles, swapped_backgrounds(samples, generator))
+    of_moves = None if backgrounds is None else backgrounds[index]
     return {
-        "here": draw_point_mazes(agents, obstacles, behind),
-        "others": draw_point_mazes(agents[others], obstacles[others], behind),
-        "moved": draw_point_mazes(agents[index], moves["obstacles"], None if behind is None else behind[index]),
+        "here": render_point_mazes(agents, obstacles, backgrounds),
+        "others": render_point_mazes(agents[others], obstacles[others], backgrounds),
+        "moved": render_point_mazes(agents[index], moves["obstacles"], of_moves),
         "nudged": nudged,
         "swapped": swapped,
         "moves": moves,
@@ -162,7 +143,7 @@ def _edge_distance(agents: NDArray[np.float64], centers: NDArray[np.float64]) ->
 def _moves(
     agents: NDArray[np.float64], obstacles: NDArray[np.float64], generator: np.random.Generator
 ) -> dict[str, NDArray[Any]]:
-    """Every obstacle of every state moved in a direction drawn at random, where that is a possible state.
+    """Every obstacle of every state moved in a random direction, where that is a possible state.
 
     An obstacle may touch neither the agent's disc nor the goal, nor leave the room.
     """
@@ -185,10 +166,10 @@ def _moves(
 def _nudged(
     agents: NDArray[np.float64],
     obstacles: NDArray[np.float64],
-    behind: NDArray[np.uint8] | None,
+    backgrounds: NDArray[np.uint8] | None,
     generator: np.random.Generator,
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Pictures with the agent moved by a step over free floor, and the states they belong to."""
+    """Observations with the agent moved by a step over free floor, and the states that they belong to."""
     new = agents + STEP * DIRECTIONS[generator.integers(len(DIRECTIONS), size=len(agents))]
     free = np.abs(new).max(axis=1) <= ROOM_SIZE / 2 - AGENT_RADIUS
     for k in range(obstacles.shape[1]):
@@ -196,7 +177,7 @@ def _nudged(
     if not free.any():
         raise ValueError(f"no agent of {len(agents)} states has room to move; take more states")
     who = np.flatnonzero(free)
-    return draw_point_mazes(new[who], obstacles[who], None if behind is None else behind[who]), who
+    return render_point_mazes(new[who], obstacles[who], None if backgrounds is None else backgrounds[who]), who
 
 
 def _offset_map(offsets: NDArray[np.float64], values: NDArray[Any]) -> NDArray[np.float64]:

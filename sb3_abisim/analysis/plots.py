@@ -1,4 +1,4 @@
-"""The figures, drawn from the numbers that the other modules of this package compute. Needs the extra ``plots``."""
+"""The figures, plotted from the numbers that the other modules of this folder compute. Needs the extra ``plots``."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 DPI = 90
 CMAP = "inferno"
-PIXEL_RENDER = {"agent": (214, 40, 40), "obstacles": (60, 64, 72), "floor": (240, 240, 235), "goal": (46, 160, 67)}
+COLORS = {"agent": (214, 40, 40), "obstacles": (60, 64, 72), "floor": (240, 240, 235), "goal": (46, 160, 67)}
 
 
 def pyplot() -> Any:
@@ -60,7 +60,7 @@ def _bin_names(bins: Iterable[tuple[float, float]]) -> list[str]:
 
 
 def show_map(axis: Any, values: NDArray[np.float64], title: str, reach: int, unit: str) -> Any:
-    """Draw a map by offset around the agent, brightness relative to its largest value.
+    """Plot a map by offset around the agent, brightness relative to its largest value.
 
     :param axis: of matplotlib
     :param values: [dy, dx], odd sides, the agent in the middle
@@ -79,7 +79,7 @@ def show_map(axis: Any, values: NDArray[np.float64], title: str, reach: int, uni
 
 
 def show_profiles(axis: Any, lines: dict[str, list[float]], bins: Any, xlabel: str) -> None:
-    """Draw sensitivity by distance on a logarithmic scale.
+    """Plot sensitivity by distance on a logarithmic scale.
 
     :param axis: of matplotlib
     :param lines: label to a number for each bin
@@ -95,7 +95,7 @@ def show_profiles(axis: Any, lines: dict[str, list[float]], bins: Any, xlabel: s
     axis.legend(fontsize=7)
 
 
-def draw_maps(results: dict[str, Any], path: Path) -> None:
+def plot_maps(results: dict[str, Any], path: Path) -> None:
     """Perturbation maps in a row, and their profiles.
 
     :param results: of :func:`~sb3_abisim.analysis.perturbation.nav2d_maps`
@@ -114,7 +114,7 @@ def draw_maps(results: dict[str, Any], path: Path) -> None:
     save(figure, path)
 
 
-def draw_sweep(results: dict[str, Any], path: Path) -> None:
+def plot_sweep(results: dict[str, Any], path: Path) -> None:
     """Learned maps over exact ones, a column for each c, and the profiles of both.
 
     :param results: of :func:`~sb3_abisim.analysis.perturbation.sweep_maps`
@@ -135,7 +135,7 @@ def draw_sweep(results: dict[str, Any], path: Path) -> None:
     save(figure, path)
 
 
-def draw_near_and_far(results: dict[str, Any], path: Path) -> None:
+def plot_near_and_far(results: dict[str, Any], path: Path) -> None:
     """Violins of near and far changes, and the regions.
 
     :param results: of :func:`~sb3_abisim.analysis.perturbation.near_and_far`
@@ -149,7 +149,7 @@ def draw_near_and_far(results: dict[str, Any], path: Path) -> None:
         axis.violinplot([result["near"], result["far"]], showmedians=True)
         axis.set_xticks([1, 2], ["near", "far"])
         axis.set_title(f"{short_name(name)}\nnear > far in {result['near_share']:.0%}", fontsize=9)
-        # A scale for each: what pictures' reconstruction makes of an obstacle is ten times what dynamics make of it.
+        # A scale for each: an obstacle counts ten times as much where observations are reconstructed.
         axis.set_ylim(bottom=0)
         axis.grid(axis="y", alpha=0.3)
     axes[0].set_ylabel("change of the embedding\n(1: the agent elsewhere)")
@@ -163,19 +163,19 @@ def _show_regions(axis: Any, results: dict[str, Any]) -> None:
     x, y = results["example"]["agent"]
     size = len(obstacles)
     distance = np.maximum(np.abs(np.arange(size)[:, None] - y), np.abs(np.arange(size)[None] - x))
-    picture = np.full((size, size, 3), 1.0)
-    picture[distance <= results["near_reach"]] = (1.0, 0.80, 0.45)
-    picture[distance >= results["far_reach"]] = (0.70, 0.85, 1.0)
+    image = np.full((size, size, 3), 1.0)
+    image[distance <= results["near_reach"]] = (1.0, 0.80, 0.45)
+    image[distance >= results["far_reach"]] = (0.70, 0.85, 1.0)
     for name, where in (("obstacles", obstacles), ("goal", np.zeros_like(obstacles)), ("agent", distance == 0)):
-        picture[where] = np.array(PIXEL_RENDER[name]) / 255
-    picture[size // 2, size // 2] = np.array(PIXEL_RENDER["goal"]) / 255
-    axis.imshow(picture)
+        image[where] = np.array(COLORS[name]) / 255
+    image[size // 2, size // 2] = np.array(COLORS["goal"]) / 255
+    axis.imshow(image)
     axis.set_xticks([])
     axis.set_yticks([])
     axis.set_title("regions: near (orange), far (blue)", fontsize=9)
 
 
-def draw_structures(results: dict[str, Any], path: Path) -> None:
+def plot_structures(results: dict[str, Any], path: Path) -> None:
     """Sensitivity to each cell of a fixed structure, and its profiles by kind of cell.
 
     :param results: of :func:`~sb3_abisim.analysis.perturbation.structure_maps`

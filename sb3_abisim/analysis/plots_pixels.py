@@ -4,13 +4,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
+from sb3_abisim.registry import get_traits
 
 N_COLORS = 256
 
 
-def draw_pixel_maps(results: dict[str, Any], path: Path) -> None:
+def plot_pixel_maps(results: dict[str, Any], path: Path) -> None:
     """Maps of a moved obstacle, profiles by distance, and what other changes do.
 
     :param results: of :func:`~sb3_abisim.analysis.pixels.pixel_maps`
@@ -57,54 +59,63 @@ def _show_changes(axis: Any, here: dict[str, Any]) -> None:
     axis.set_ylabel("change (1: another state)")
 
 
-def draw_neighbors(results: dict[str, Any], path: Path) -> None:
-    """Queries in the first row, each encoder's nearest neighbors below with their distances; settings side by side.
+def plot_neighbors(results: dict[str, Any], path: Path) -> None:
+    """Queries in the first row, each encoder's nearest neighbors below with distances; settings side by side.
 
     :param results: of :func:`~sb3_abisim.analysis.neighbors.neighbors`
     :param path: the PNG
     """
     plt = pyplot()
-    pictures = results["pictures"]
-    rows = list(next(iter(pictures.values())))
-    columns = [(setting, k) for setting, frames in pictures.items() for k in range(len(frames["query"]))]
-    unit = "cells" if results["env_id"].startswith("Nav2D") else "m"
+    observations = results["observations"]
+    rows = list(next(iter(observations.values())))
+    columns = [(setting, k) for setting, shown in observations.items() for k in range(len(shown["query"]))]
+    unit = get_traits(results["env_id"]).length_unit
     figure, axes = plt.subplots(
         len(rows), len(columns), figsize=(1.2 * len(columns) + 0.4, 1.5 * len(rows) + 0.5), constrained_layout=True
     )
     for row, name in zip(axes, rows, strict=True):
         for axis, (setting, k) in zip(row, columns, strict=True):
-            axis.imshow(pictures[setting][name][k][:3].transpose(1, 2, 0))
+            axis.imshow(_visible(observations[setting][name][k]))
             axis.set_xticks([])
             axis.set_yticks([])
             if name == "query":
                 axis.set_title(setting, fontsize=7)
                 continue
             example = results["settings"][setting][name]["examples"]
+            agent = "" if not example["agent"] else f", {example['agent'][k]:.1f} {unit}"
             clip = "" if not example["same_clip"] else ("same clip" if example["same_clip"][k] else "other clip")
-            axis.set_title(f"d {example['distance'][k]:.2f}, {example['agent'][k]:.1f} {unit}\n{clip}", fontsize=6)
+            axis.set_title(f"d {example['distance'][k]:.2f}{agent}\n{clip}", fontsize=6)
         row[0].set_ylabel(name.rsplit("/", 1)[-1].removesuffix(".safetensors"), fontsize=7)
     # One setting makes a narrow figure.
-    gap = "\n" if len(pictures) == 1 else " "
+    gap = "\n" if len(observations) == 1 else " "
+    with_agents = any(one["random pairs"]["agent"] is not None for one in results["settings"].values())
+    agents = f"; {unit}: distance of the agents" if with_agents else ""
     figure.suptitle(
         f"Nearest states of other episodes, {results['env_id']} (d: distance of the embeddings,{gap}1 is the mean of "
-        f"all neighbors; {unit}: distance of the agents)",
+        f"all neighbors{agents})",
         fontsize=8,
     )
     save(figure, path)
     _reduce_colors(path)
 
 
+def _visible(observation: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Three channels, last: the first three, or of fewer the first one in gray."""
+    channels = observation[:3] if len(observation) >= 3 else observation[:1].repeat(3, axis=0)
+    return channels.transpose(1, 2, 0)
+
+
 def _reduce_colors(path: Path) -> None:
     """Photographs and many panels make large PNGs; with a palette they take a third of that."""
     from PIL import Image
 
-    with Image.open(path) as picture:
-        small = picture.convert("RGB").quantize(N_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    with Image.open(path) as image:
+        small = image.convert("RGB").quantize(N_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     small.save(path, optimize=True)
 
 
-def draw_probes(results: dict[str, Any], path: Path) -> None:
-    """Bars of every probe's score with confidence intervals where there are several seeds.
+def plot_probes(results: dict[str, Any], path: Path) -> None:
+    """Bars of the score of every probe, with confidence intervals where there are several seeds.
 
     :param results: of :func:`~sb3_abisim.analysis.probes.probes`
     :param path: the PNG
@@ -120,9 +131,9 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
     for axis, (setting, names) in zip(axes[0], settings.items(), strict=True):
         for k, (objective, group) in enumerate(groups.items()):
             for j, kind in enumerate(kinds):
-                cells = [group["scores"][setting][target][kind] for target in names]
-                heights = [np.nan if cell is None else max(cell[0], -0.2) for cell in cells]
-                errors = [0.0 if cell is None or cell[1] is None else cell[1] for cell in cells]
+                scores = [group["scores"][setting][target][kind] for target in names]
+                heights = [np.nan if score is None else max(score[0], -0.2) for score in scores]
+                errors = [0.0 if score is None or score[1] is None else score[1] for score in scores]
                 place = np.arange(len(names)) + (k * len(kinds) + j - (len(groups) * len(kinds) - 1) / 2) * width
                 style = {"color": f"C{k}", "alpha": 0.5 if kind == "linear" else 1.0, "label": f"{objective}, {kind}"}
                 axis.bar(place, heights, width, yerr=errors if any(errors) else None, **style)
@@ -139,7 +150,7 @@ def draw_probes(results: dict[str, Any], path: Path) -> None:
     save(figure, path)
 
 
-def draw_curves(results: dict[str, Any], path: Path) -> None:
+def plot_curves(results: dict[str, Any], path: Path) -> None:
     """The main pretraining curve of each encoder.
 
     :param results: of :func:`~sb3_abisim.analysis.curves.curves`
@@ -151,11 +162,10 @@ def draw_curves(results: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(1, n, figsize=(3.6 * n, 2.9), constrained_layout=True, squeeze=False)
     for axis, (name, result) in zip(axes[0], encoders.items(), strict=True):
         term = result["term"]
-        for part in ("test", "train"):
-            key = f"{part}/{term.split('/')[1]}"
+        for split in ("eval", "train"):
+            key = f"{split}/{term.split('/')[1]}"
             if key in result["curves"]:
-                label = "held-out episodes" if part == "test" else "training"
-                axis.plot(result["curves"]["n_updates"], result["curves"][key], marker=".", label=label)
+                axis.plot(result["curves"]["n_updates"], result["curves"][key], marker=".", label=f"{split} episodes")
         axis.set(xlabel="updates", ylabel=term.split("/")[1])
         axis.set_title(short_name(name), fontsize=9)
         axis.grid(alpha=0.3)
@@ -164,8 +174,8 @@ def draw_curves(results: dict[str, Any], path: Path) -> None:
     save(figure, path)
 
 
-def draw_leak(results: dict[str, Any], path: Path) -> None:
-    """What each patch tells about the action, by itself.
+def plot_leak(results: dict[str, Any], path: Path) -> None:
+    """How well each patch, by itself, predicts the action.
 
     :param results: of :func:`~sb3_abisim.analysis.leak.leak_maps`
     :param path: the PNG

@@ -1,10 +1,13 @@
 """Probes: what can be read from an embedding, by a ridge regression and by a small network.
 
-Probes learn from frames of some layouts and are tested on frames of others, in two settings where the environment
-shows clips: on the clips of pretraining, and on unseen ones. Agent and surroundings are always learned on the clips of
-pretraining; clip and phase can only be read by a probe that knows the clip, so those are learned on the tested side's
-own clips (in other layouts). Targets are continuous (scored by the coefficient of determination), yes or no (area
+Probes learn from observations of some episodes and are scored on those of others. Where the environment has splits
+there are two settings: probes are scored on the train split, and on the eval split. They always learn on the train
+split, except for clip and phase: only a probe that knows a clip can read those, so they are learned on the clips that
+are scored (in other layouts). Targets are continuous (scored by the coefficient of determination), yes or no (area
 under the ROC curve, mean over the points around the agent) or classes (share of correct answers).
+
+Of Nav2D, the point mazes and ScanNav the targets are the agent and its surroundings. Of any other environment they are
+all of its ``factors()``.
 """
 
 import warnings
@@ -16,8 +19,16 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
-from sb3_abisim.analysis.pixels import backgrounds_of, clip_settings, clips_of, swapped_backgrounds
-from sb3_abisim.analysis.scenes import Samples, draw_point_mazes, local_obstacles, position_in_picture, sample_episodes
+from sb3_abisim.analysis.pixels import backgrounds_of, clips_of, swapped_backgrounds
+from sb3_abisim.analysis.scenes import (
+    Samples,
+    agent_positions,
+    eval_settings,
+    local_obstacles,
+    render_point_mazes,
+    sample_episodes,
+)
+from sb3_abisim.benchmark.report.statistics import mean_and_interval
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile
 
@@ -58,17 +69,19 @@ class Target:
 
 
 def targets(samples: Samples) -> dict[str, Target]:
-    """What is to be read from a picture; goals that never move and clips that are not shown are left out.
+    """What is to be read from an observation; goals that never move and clips that are not shown are left out.
 
     A heading is read as cosine and sine.
 
-    :param samples: with factors
+    :param samples: of an environment with factors
+    :raises ValueError: for one without
     """
-    factors = samples.factors
-    found = {
-        "agent": Target(position_in_picture(factors), "continuous"),
-        "obstacles": Target(local_obstacles(factors).astype(np.float64), "binary"),
-    }
+    factors, agents, obstacles = samples.factors, agent_positions(samples), local_obstacles(samples)
+    if not factors:
+        raise ValueError("probes read an environment's factors(), and this one has none; add them to its batch class")
+    if agents is None or obstacles is None:
+        return {name: _plain_target(values) for name, values in factors.items()}
+    found = {"agent": Target(agents, "continuous"), "obstacles": Target(obstacles.astype(np.float64), "binary")}
     if "heading" in factors:
         angle = np.deg2rad(factors["heading"].astype(np.float64))
         found["heading"] = Target(np.stack([np.cos(angle), np.sin(angle)], axis=1), "continuous")
@@ -76,10 +89,15 @@ def targets(samples: Samples) -> dict[str, Target]:
         found["goal"] = Target(factors["goal"].astype(np.float64), "continuous")
     clips = clips_of(samples)
     if clips is not None:
-        # All clips of the side, in its order, so that classes are the same in every sample.
+        # All clips of the split, in its order, so that classes are the same in every sample.
         found["clip"] = Target((factors["clip_id"][:, None] == clips.clip_ids).astype(np.float64), "classes")
         found["phase"] = Target((factors["frame"] / (clips.lengths[factors["clip"]] - 1))[:, None], "continuous")
     return found
+
+
+def _plain_target(values: NDArray[Any]) -> Target:
+    numbers = values.reshape(len(values), -1).astype(np.float64)
+    return Target(numbers, "binary" if values.dtype == bool else "continuous")
 
 
 def make_probe(kind: str) -> Any:
@@ -107,7 +125,7 @@ def read(
     :param kind: one of :data:`PROBES`
     :param features: (n, features_dim)
     :param target: to learn
-    :param test_features: of other layouts, (m, features_dim)
+    :param test_features: of other episodes, (m, features_dim)
     :param test_target: to score
     :return: see :meth:`Target.score`
     """
@@ -128,26 +146,29 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     """The whole table of an environment, with an untrained encoder for comparison.
 
     :param files: encoders by name
-    :param env_id: a registered id of ours
-    :param n_episodes: to learn from, and as many again for each test
+    :param env_id: a registered id, of an environment with factors
+    :param n_episodes: to learn from, and as many again for each score
     :param seed: of the episodes and the untrained weights
     :return: per encoder: objective, seed, ``scores`` by setting
-        (:func:`~sb3_abisim.analysis.pixels.clip_settings`), target and probe, and ``invariance`` by setting
+        (:func:`~sb3_abisim.analysis.scenes.eval_settings`), target and probe, and ``invariance`` by setting
         (:func:`invariance_ratio`; None without clips), and ``clip_shifts``
+    :raises ValueError: for an environment without factors, or two encoders of one objective and seed
     """
     # Before minutes of computing.
     _refuse_twins([_origin(file) for file in files.values()])
-    settings = clip_settings(env_id)
+    settings = eval_settings(env_id)
     learn, test = (
         {name: sample_episodes(env_id, n_episodes, PER_EPISODE, 2 * seed + k, kw) for name, kw in settings.items()}
         for k in (1, 2)
     )
-    pictures = next(iter(learn.values())).frames
-    th.manual_seed(seed)
+    observations = next(iter(learn.values())).obs
     encoders: dict[str, tuple[Encoder, dict[str, Any]]] = {
         name: (file.encoder.eval(), {"hash": file.hash, **_origin(file)}) for name, file in files.items()
     }
-    untrained = make_encoder(_space_of(pictures)).eval()
+    # The network of the first one, with random weights.
+    network = next(iter(files.values())).encoder.spec()
+    th.manual_seed(seed)
+    untrained = make_encoder(_space_of(observations), network["name"], **network["kwargs"]).eval()
     encoders[UNTRAINED] = (untrained, {"hash": None, "objective": UNTRAINED, "seed": seed})
     results = {}
     for name, (encoder, origin) in encoders.items():
@@ -155,13 +176,13 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
         ratios = {setting: invariance_ratio(encoder, test[setting]) for setting in settings}
         shifts = clip_shifts(encoder, next(iter(test.values())), list(test.values()))
         results[name] = {**origin, "scores": scores, "invariance": ratios, "clip_shifts": shifts}
-    return {"n_frames": len(pictures), "encoders": results, "groups": by_objective(results)}
+    return {"n_observations": len(observations), "encoders": results, "groups": by_objective(results)}
 
 
-def _space_of(frames: NDArray[np.uint8]) -> Any:
+def _space_of(observations: NDArray[np.uint8]) -> Any:
     from gymnasium.spaces import Box
 
-    return Box(0, 255, frames.shape[1:], np.uint8)
+    return Box(0, 255, observations.shape[1:], np.uint8)
 
 
 def _origin(file: EncoderFile) -> dict[str, Any]:
@@ -174,7 +195,7 @@ def _scores(encoder: Encoder, learn: dict[str, Samples], test: dict[str, Samples
 
     def features(samples: Samples) -> NDArray[Any]:
         if id(samples) not in embedded:
-            embedded[id(samples)] = embed(encoder, samples.frames).numpy()
+            embedded[id(samples)] = embed(encoder, samples.obs).numpy()
         return embedded[id(samples)]
 
     scores = {}
@@ -191,19 +212,19 @@ def invariance_ratio(encoder: Encoder, samples: Samples, seed: int = 0) -> float
     0 is an encoder that does not see the background, 1 one for which a new clip is as much as a new state.
 
     :param encoder: in evaluation mode
-    :param samples: :data:`PER_EPISODE` of each episode, with factors
+    :param samples: :data:`PER_EPISODE` of each episode
     :param seed: of the choices
     :return: None for environments without clips
     """
-    behind = backgrounds_of(samples)
-    if behind is None:
+    backgrounds = backgrounds_of(samples)
+    if backgrounds is None:
         return None
     generator = np.random.default_rng(seed)
     agents, obstacles = samples.factors["agent"], samples.factors["obstacles"]
     others = np.roll(np.arange(len(samples)), PER_EPISODE)
-    here = embed(encoder, draw_point_mazes(agents, obstacles, behind))
-    elsewhere = embed(encoder, draw_point_mazes(agents[others], obstacles[others], behind))
-    swapped = embed(encoder, draw_point_mazes(agents, obstacles, swapped_backgrounds(samples, generator)))
+    here = embed(encoder, render_point_mazes(agents, obstacles, backgrounds))
+    elsewhere = embed(encoder, render_point_mazes(agents[others], obstacles[others], backgrounds))
+    swapped = embed(encoder, render_point_mazes(agents, obstacles, swapped_backgrounds(samples, generator)))
     return float((here - swapped).abs().sum(dim=1).mean() / (here - elsewhere).abs().sum(dim=1).mean())
 
 
@@ -211,11 +232,11 @@ def clip_shifts(encoder: Encoder, reference: Samples, samples: list[Samples]) ->
     """How far each clip moves the mean embedding, in units of the mean distance of states from their mean.
 
     :param encoder: in evaluation mode
-    :param reference: of the clips of pretraining; its mean embedding is where distances are measured from
-    :param samples: of the clips to look at, with factors
+    :param reference: of the train clips; its mean embedding is where distances are measured from
+    :param samples: of the clips to look at
     :return: by name of the clip; empty without clips
     """
-    features = embed(encoder, reference.frames)
+    features = embed(encoder, reference.obs)
     center = features.mean(dim=0)
     unit = (features - center).abs().sum(dim=1).mean()
     shifts = {}
@@ -223,7 +244,7 @@ def clip_shifts(encoder: Encoder, reference: Samples, samples: list[Samples]) ->
         clips = clips_of(one)
         if clips is None:
             continue
-        features = embed(encoder, one.frames)
+        features = embed(encoder, one.obs)
         shown = th.as_tensor(one.factors["clip"])
         for k in np.unique(one.factors["clip"]).tolist():
             shifts[clips.names[k]] = float((features[shown == k].mean(dim=0) - center).abs().sum() / unit)
@@ -247,7 +268,7 @@ def by_objective(results: dict[str, Any]) -> dict[str, Any]:
         scores = {
             setting: {
                 target: {
-                    kind: mean_interval([member["scores"][setting][target][kind] for member in members])
+                    kind: _over_seeds([member["scores"][setting][target][kind] for member in members])
                     for kind in PROBES
                 }
                 for target in members[0]["scores"][setting]
@@ -255,7 +276,7 @@ def by_objective(results: dict[str, Any]) -> dict[str, Any]:
             for setting in members[0]["scores"]
         }
         ratios = {
-            setting: mean_interval([member["invariance"][setting] for member in members])
+            setting: _over_seeds([member["invariance"][setting] for member in members])
             for setting in members[0]["invariance"]
         }
         summary[objective] = {"n_seeds": len(members), "scores": scores, "invariance": ratios}
@@ -272,24 +293,17 @@ def _refuse_twins(origins: list[dict[str, Any]]) -> None:
         )
 
 
-def mean_interval(values: list[float | None]) -> tuple[float, float | None] | None:
-    """Mean and half width of its 95 % confidence interval; the latter None for one value, all None without values.
-
-    :param values: one per seed
-    """
+def _over_seeds(values: list[float | None]) -> tuple[float, float | None] | None:
+    """Mean and half width of its interval; the latter None for one seed, all None without values."""
     numbers = [value for value in values if value is not None]
     if not numbers:
         return None
-    if len(numbers) == 1:
-        return numbers[0], None
-    from scipy.stats import t
-
-    half = t.ppf(0.975, len(numbers) - 1) * np.std(numbers, ddof=1) / np.sqrt(len(numbers))
-    return float(np.mean(numbers)), float(half)
+    mean, half = mean_and_interval(np.array(numbers))
+    return float(mean), None if len(numbers) == 1 else float(half)
 
 
 def table(results: dict[str, Any]) -> str:
-    """The results of :func:`probes` as a Markdown table, ``linear / MLP`` in each cell.
+    """The results of :func:`probes` as a Markdown table, ``linear / MLP`` in each entry.
 
     :param results: what it returned
     """
@@ -300,8 +314,8 @@ def table(results: dict[str, Any]) -> str:
     header += [f"invariance ratio, {setting}" for setting in ratios]
     rows = [header, ["---", *["---:"] * (len(header) - 1)]]
     for objective, group in results["groups"].items():
-        cells = [group["scores"][setting][target] for setting, target in columns]
-        words = [" / ".join(_number(cell[kind]) for kind in PROBES) for cell in cells]
+        scores = [group["scores"][setting][target] for setting, target in columns]
+        words = [" / ".join(_number(score[kind]) for kind in PROBES) for score in scores]
         row = [objective, str(group["n_seeds"]), *words]
         rows.append(row + [_number(group["invariance"][setting]) for setting in ratios])
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)

@@ -1,18 +1,21 @@
-"""States of fresh episodes, what surrounds the agent in them, and pictures of states that no episode has been in."""
+"""States of new episodes, what surrounds the agent in them, and observations of states that no episode has been in."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.analysis.nav2d_exact import HELD_OUT_SEED
+from sb3_abisim.analysis.nav2d_exact import EVAL_SEED
 from sb3_abisim.data.collect import collect_shard, make_vector_env
+from sb3_abisim.data.format import check_spaces
 from sb3_abisim.envs.backgrounds.player import composite
-from sb3_abisim.envs.base import BatchEnv
-from sb3_abisim.envs.nav2d import SIZE
+from sb3_abisim.envs.base import BatchEnv, batch_class
+from sb3_abisim.envs.nav2d import SIZE, Nav2DVectorEnv
 from sb3_abisim.envs.point_maze import top_down
-from sb3_abisim.envs.point_maze.env import ROOM_SIZE
+from sb3_abisim.envs.point_maze.distractors import DistractorPointMazeVectorEnv
+from sb3_abisim.envs.point_maze.env import ROOM_SIZE, PointMazeVectorEnv
 from sb3_abisim.envs.point_maze.layout import (
     GOAL_MASK,
     OBSTACLE_PIXELS,
@@ -21,14 +24,17 @@ from sb3_abisim.envs.point_maze.layout import (
     static_layer,
     to_pixels,
 )
-from sb3_abisim.envs.scan_nav.apartment import SEEDS
+from sb3_abisim.envs.scan_nav.env import ScanNavVectorEnv
 from sb3_abisim.envs.scan_nav.map import ScanMap
+from sb3_abisim.registry import get_traits
 
-# Copies collected at once; 64 x 64 pictures of a whole episode take 1.6 MB.
+# Copies collected at once; the 64 x 64 observations of a whole episode take 1.6 MB.
 N_COPIES = 50
+# Of an episode in an environment without a time limit, and of all observations that are held at once.
+MAX_STEPS = 1000
+MAX_BYTES = 2**30
 # Points around the agent, this many cells, meters or steps in each direction.
 LOCAL_REACH = 2
-SCAN_STEP = 0.25  # m, ScanNav's step forward
 _HALF_OBSTACLE = OBSTACLE_PIXELS / PIXELS_PER_METER / 2
 
 
@@ -36,107 +42,141 @@ _HALF_OBSTACLE = OBSTACLE_PIXELS / PIXELS_PER_METER / 2
 class Samples:
     """Transitions of random play with the simulator's state at their beginning.
 
-    :param frames: s_t, uint8 (n, channels, height, width)
+    :param env: the environment that they are from
+    :param obs: s_t, uint8 (n, channels, height, width)
     :param actions: a_t, (n,) or (n, action_dim)
-    :param next_frames: s_{t+1}, as ``frames``
-    :param factors: name to (n, ...)
+    :param next_obs: s_{t+1}, as ``obs``
+    :param factors: name to (n, ...); empty where the environment has none
     :param episodes: which episode, (n,); another episode is another layout, except where the environment has one only
     """
 
-    frames: NDArray[np.uint8]
+    env: Any
+    obs: NDArray[np.uint8]
     actions: NDArray[Any]
-    next_frames: NDArray[np.uint8]
+    next_obs: NDArray[np.uint8]
     factors: dict[str, NDArray[Any]]
     episodes: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.obs)
+
+
+def eval_settings(env_id: str) -> dict[str, dict[str, Any]]:
+    """What encoders are looked at on: name to the environment's keyword arguments. The first is that of pretraining.
+
+    :param env_id: a registered id
+    """
+    traits, found = get_traits(env_id), batch_class(env_id)
+    if {"train", "eval"} <= set(traits.splits):
+        what, plain = "split", {}
+        if found is not None and issubclass(found, DistractorPointMazeVectorEnv):
+            what, plain = "clips", {"color_jitter": False}
+        kwargs = dict(traits.collect_kwargs)
+        return {f"train {what}": {**kwargs, "split": "train", **plain}, f"eval {what}": {**kwargs, "split": "eval"}}
+    # Elsewhere a new episode need not be a new layout: there are five apartments.
+    new_layouts = found is not None and issubclass(found, Nav2DVectorEnv | PointMazeVectorEnv)
+    return {"eval layouts" if new_layouts else "eval episodes": dict(traits.collect_kwargs)}
 
 
 def sample_episodes(
     env_id: str, n_episodes: int, per_episode: int, seed: int = 0, env_kwargs: dict[str, Any] | None = None
 ) -> Samples:
-    """Play fresh episodes at random and keep a few transitions of each.
+    """Play new episodes at random and keep a few transitions of each.
 
-    :param env_id: a registered id of ours
+    :param env_id: a registered id, of image observations
     :param n_episodes: at least 1
-    :param per_episode: transitions drawn from each; shorter episodes give all they have
+    :param per_episode: transitions sampled from each; shorter episodes give all they have
     :param seed: other seeds give other episodes; none are those of a dataset
     :param env_kwargs: passed to the environment
-    :raises ValueError: for ``n_episodes`` below 1, or an unknown environment
+    :raises ValueError: for ``n_episodes`` below 1, an unknown environment, or one without image observations
     """
     if n_episodes < 1:
         raise ValueError(f"the number of episodes must be at least 1, got {n_episodes}")
     env = make_vector_env(env_id, min(N_COPIES, n_episodes), env_kwargs or {})
+    check_spaces(env.single_observation_space, env.single_action_space)
     batch = env.unwrapped
-    # Segments of such environments come without frames.
-    draw = batch.draw if isinstance(batch, BatchEnv) and batch.draws_factors else None
-    limit = env.spec.max_episode_steps if env.spec is not None else None
-    assert limit is not None, "ours have a time limit"
-    sequence = np.random.SeedSequence([HELD_OUT_SEED, seed])
+    # Segments of such environments come without observations.
+    render = batch.render_factors if isinstance(batch, BatchEnv) and batch.renders_factors else None
+    sequence = np.random.SeedSequence([EVAL_SEED, seed])
     generator = np.random.default_rng(sequence.spawn(1)[0])
+    n_steps = (env.spec.max_episode_steps if env.spec is not None else None) or MAX_STEPS
+    if render is None:
+        # An episode is left where its observations would take too much memory.
+        size = env.num_envs * math.prod(env.single_observation_space.shape or ())
+        n_steps = min(n_steps, max(1, MAX_BYTES // size))
     rows: list[tuple[Any, ...]] = []
     n = 0
     while n < n_episodes:
-        segments = collect_shard(env, limit, limit * env.num_envs, sequence.spawn(1)[0])
+        segments = collect_shard(env, n_steps, n_steps * env.num_envs, sequence.spawn(1)[0])
         for segment in segments[: n_episodes - n]:
             length = len(segment.actions)
             for t in np.sort(generator.permutation(length)[:per_episode]).tolist():
                 state = {name: array[t] for name, array in segment.factors.items()}
-                if draw is None:
+                if render is None:
                     assert segment.frames is not None
-                    now, later = segment.frames[t], segment.frames[t + 1]
+                    obs, next_obs = segment.frames[t], segment.frames[t + 1]
                 else:
-                    now, later = draw({name: array[t : t + 2] for name, array in segment.factors.items()})
-                rows.append((now, segment.actions[t], later, state, n))
+                    obs, next_obs = render({name: array[t : t + 2] for name, array in segment.factors.items()})
+                rows.append((obs, segment.actions[t], next_obs, state, n))
             n += 1
     env.close()
-    frames, actions, next_frames, states, episodes = zip(*rows, strict=True)
+    observations, actions, next_observations, states, episodes = zip(*rows, strict=True)
     factors = {name: np.array([state[name] for state in states]) for name in states[0]}
-    return Samples(np.array(frames), np.array(actions), np.array(next_frames), factors, np.array(episodes))
+    return Samples(
+        batch, np.array(observations), np.array(actions), np.array(next_observations), factors, np.array(episodes)
+    )
 
 
-def position_in_picture(factors: dict[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Where the agent is, (n, 2) in cells or meters; in ScanNav, whose camera hangs above the goal, from the goal.
+def agent_positions(samples: Samples) -> NDArray[np.float64] | None:
+    """Where the agent is in the observation, (n, 2) in cells or meters; None where that is not known.
 
-    :param factors: of :class:`Samples`
+    In ScanNav the camera hangs above the goal, so that positions are from there.
+
+    :param samples: of any environment
     """
-    agents = factors["agent"] - factors["goal"] if "scene" in factors else factors["agent"]
-    return np.asarray(agents, dtype=np.float64)
+    factors = samples.factors
+    if isinstance(samples.env, ScanNavVectorEnv):
+        return np.asarray(factors["agent"] - factors["goal"], dtype=np.float64)
+    if isinstance(samples.env, Nav2DVectorEnv | PointMazeVectorEnv):
+        return np.asarray(factors["agent"], dtype=np.float64)
+    return None
 
 
-def local_obstacles(factors: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def local_obstacles(samples: Samples) -> NDArray[np.bool_] | None:
     """Whether the points around the agent are blocked, by an obstacle or because they lie outside.
 
-    Points are a cell (Nav2D), a meter (the point mazes) or a step (the built-in flats of ScanNav) apart, up to
-    :data:`LOCAL_REACH` in each direction.
+    Points are a cell (Nav2D), a meter (the point mazes) or a step (ScanNav) apart, up to :data:`LOCAL_REACH` in each
+    direction.
 
-    :param factors: of :class:`Samples`
-    :return: (n, (2 LOCAL_REACH + 1)^2 - 1), row by row
+    :param samples: of any environment
+    :return: (n, (2 LOCAL_REACH + 1)^2 - 1), row by row; None where obstacles are not known
     """
     steps = np.arange(-LOCAL_REACH, LOCAL_REACH + 1)
     offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     offsets = offsets[(offsets != 0).any(axis=1)]
-    if "scene" in factors:
-        return _blocked_in_flats(factors["agent"][:, None] + SCAN_STEP * offsets, factors["scene"])
-    points = factors["agent"][:, None] + offsets
-    obstacles = factors["obstacles"]
-    if obstacles.dtype == bool:
+    env, factors = samples.env, samples.factors
+    if isinstance(env, ScanNavVectorEnv):
+        return _blocked_in_scans(factors["agent"][:, None] + env.forward_step * offsets, factors["scene"], env.scans)
+    if isinstance(env, Nav2DVectorEnv):
+        points = factors["agent"][:, None] + offsets
         outside = ((points < 0) | (points >= SIZE)).any(axis=-1)
         x, y = np.moveaxis(np.clip(points, 0, SIZE - 1), -1, 0)
-        blocked: NDArray[np.bool_] = outside | obstacles[np.arange(len(points))[:, None], y, x]
+        blocked: NDArray[np.bool_] = outside | factors["obstacles"][np.arange(len(points))[:, None], y, x]
         return blocked
-    outside = (np.abs(points) > ROOM_SIZE / 2).any(axis=-1)
-    within = (np.abs(points[:, :, None] - obstacles[:, None]) < _HALF_OBSTACLE).all(axis=-1)
-    blocked = outside | within.any(axis=-1)
-    return blocked
+    if isinstance(env, PointMazeVectorEnv):
+        points = factors["agent"][:, None] + offsets
+        outside = (np.abs(points) > ROOM_SIZE / 2).any(axis=-1)
+        within = (np.abs(points[:, :, None] - factors["obstacles"][:, None]) < _HALF_OBSTACLE).all(axis=-1)
+        blocked = outside | within.any(axis=-1)
+        return blocked
+    return None
 
 
-def _blocked_in_flats(points: NDArray[Any], scenes: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether an agent's center cannot be at (x, y) in m, (n, m, 2), of the flats (n,)."""
+def _blocked_in_scans(points: NDArray[Any], scenes: NDArray[Any], scans: list[ScanMap]) -> NDArray[np.bool_]:
+    """Whether an agent's center cannot be at (x, y) in m, (n, m, 2), of the scans with these indices (n,)."""
     blocked = np.ones(points.shape[:2], dtype=bool)
     for k in np.unique(scenes).tolist():
-        scan = ScanMap.apartment(SEEDS[k])
+        scan = scans[k]
         here = scenes == k
         column = np.floor((points[here, :, 0] - scan.origin[0]) / scan.meters_per_pixel).astype(np.int64)
         row = np.floor((scan.origin[1] - points[here, :, 1]) / scan.meters_per_pixel).astype(np.int64)
@@ -147,7 +187,7 @@ def _blocked_in_flats(points: NDArray[Any], scenes: NDArray[Any]) -> NDArray[np.
     return blocked
 
 
-def draw_point_mazes(
+def render_point_mazes(
     agents: NDArray[Any], obstacles: NDArray[Any], backgrounds: NDArray[np.uint8] | None = None
 ) -> NDArray[np.uint8]:
     """Observations of the point mazes from simulator states, byte for byte those of the environments.
@@ -164,12 +204,12 @@ def draw_point_mazes(
     for solid, places in zip(solids, corners.tolist(), strict=True):
         for column, row in places:
             solid[row : row + OBSTACLE_PIXELS, column : column + OBSTACLE_PIXELS] = True
-    pictures = np.array([static_layer(solid) for solid in solids])
+    observations = np.array([static_layer(solid) for solid in solids])
     painter = top_down.DiscPainter(top_down.AGENT_RADIUS * PIXELS_PER_METER, top_down.IMAGE_SIZE)
     centers = to_pixels(agents)
-    painter.draw(pictures, centers)
+    painter.render(observations, centers)
     if backgrounds is None:
-        return pictures
+        return observations
     masks = solids | GOAL_MASK
     painter.mark(masks, centers)
-    return composite(pictures, masks, backgrounds.copy())
+    return composite(observations, masks, backgrounds.copy())

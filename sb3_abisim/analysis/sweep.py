@@ -19,7 +19,7 @@ def sweep_encoders(
     :param folder: holds ``abisim_c<c>.safetensors``
     :param data: dataset to pretrain on, needed for what is missing
     :param env_id: environment of the dataset
-    :param n_updates: of each pretraining; None for the environment's own setting
+    :param n_updates: of each pretraining; None for the environment's setting
     :raises ValueError: for missing encoders without data, data of another environment, or encoders of another base
     """
     base_hash = load_encoder(base).hash
@@ -41,7 +41,7 @@ def sweep_encoders(
             raise ValueError(f"{path} was trained with c = {found_c}, its name says {c:g}; rename or remove it")
         if (found_base := files[c].metadata["settings"]["base_hash"]) != base_hash:
             raise ValueError(
-                f"{path} was trained on another base encoder than {base} (digests {found_base[:8]}, "
+                f"{path} was trained on another base encoder than {base} (hashes {found_base[:8]}, "
                 f"{base_hash[:8]}); give that one as --base, or remove the file"
             )
     return files

@@ -1,4 +1,4 @@
-"""Compare pretraining methods: ``sb3-abisim benchmark -o DIR``, then ``... benchmark report DIR``."""
+"""Compare pretraining methods: ``sb3-abisim benchmark -o DIR``, then ``sb3-abisim benchmark report DIR``."""
 
 import argparse
 import dataclasses
@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_abisim.benchmark.export import INDEX_NAME, export
-from sb3_abisim.benchmark.jobs.job import is_by_other_code, is_done
+from sb3_abisim.benchmark.graph import build, run_labels
+from sb3_abisim.benchmark.jobs.job import Job, command_line, is_by_other_code, is_done
 from sb3_abisim.benchmark.jobs.local import Engine, make_engine, run_jobs
-from sb3_abisim.benchmark.plan import Job, Plan, build, run_labels
+from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.common.cli import PROGRAM, make_parser, run
 from sb3_abisim.common.files import write_atomic
-from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.registry import methods
 from sb3_abisim.zoo.evaluate import evaluate_final
 
@@ -39,22 +39,22 @@ def _run_parser() -> argparse.ArgumentParser:
     parser = make_parser(
         "benchmark",
         "Collect, pretrain, train and evaluate for every method, environment and seed; a rerun does only "
-        "what is missing. `report DIR` draws the comparison, `export DIR` makes a small copy for it, `evaluate RUN` "
-        "evaluates one run's final model, `sweep` searches settings of pretraining.",
+        "what is missing. Further commands, each with its --help: `benchmark report` compares the runs, `benchmark "
+        "export` makes a small copy for it, `benchmark evaluate` evaluates one run's final model, `benchmark sweep` "
+        "searches settings of pretraining.",
         "benchmark -o benchmark --env PointMaze-v0 --methods abisim ssi vanilla --seeds 0 1 2",
     )
-    words = ", ".join(methods())
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
-    parser.add_argument("--methods", nargs="+", default=list(methods()), metavar="METHOD[=ENCODER][,frozen]",
-                        help=f"of {words}; without an encoder, it is pretrained; {{seed}} in an encoder's name "
-                        "becomes the seed of pretraining (default: all)")  # fmt: skip
+    parser.add_argument("--methods", nargs="+", metavar="METHOD[=ENCODER][,frozen]",
+                        help=f"such as {', '.join(methods())}; without an encoder, it is pretrained; {{seed}} in an "
+                        "encoder's name becomes the seed of pretraining (default: all)")  # fmt: skip
     parser.add_argument("--env", nargs="+", default=list(DEFAULT_ENV_IDS), metavar="ID",
-                        help=f"of {', '.join(ENV_IDS)} (default: the paper's)")  # fmt: skip
+                        help=f"registered ids (default: the paper's, {', '.join(DEFAULT_ENV_IDS)})")  # fmt: skip
     _add_budget(parser)
     parser.add_argument("--final-episodes", type=int, default=100,
                         help="of the final model on each split, 0 for none (default: 100)")  # fmt: skip
     parser.add_argument("--dry-run", action="store_true", help="list the jobs and their commands, and stop")
-    parser.add_argument("--no-report", action="store_true", help="do not draw the report at the end")
+    parser.add_argument("--no-report", action="store_true", help="make no report at the end")
     return parser
 
 
@@ -63,9 +63,11 @@ def _add_budget(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4], help="of RL, one run each")
     parser.add_argument("--encoder-seeds", nargs="+", type=int,
                         help="of pretraining, taken by the runs in turn (default: those of --seeds)")  # fmt: skip
-    parser.add_argument("--algo", help="rl-zoo3's name (default: the paper's, dqn for Nav2D and ppo else)")
-    parser.add_argument("--n-transitions", type=int, help="to pretrain on (default: the paper's)")
-    parser.add_argument("-n", "--n-timesteps", type=int, help="of RL (default: the paper's)")
+    parser.add_argument("--algo", help="rl-zoo3's name (default: that of the environment, dqn for Nav2D, else ppo)")
+    parser.add_argument(
+        "--n-transitions", type=int, help="to pretrain on (default: as many as the environment asks for)"
+    )
+    parser.add_argument("-n", "--n-timesteps", type=int, help="of RL (default: that of the hyperparameters)")
     parser.add_argument(
         "--eval-freq", type=int, help="steps between evaluations (default: 16384 or n/100, the smaller)"
     )
@@ -84,9 +86,9 @@ def _add_budget(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--retries", type=int, default=3, help="after a lost worker, on Ray (default: 3)")
 
 
-def _plan(args: argparse.Namespace, methods: list[str], env_ids: list[str], final_episodes: int) -> Plan:
+def _plan(args: argparse.Namespace, specs: list[str], env_ids: list[str], final_episodes: int) -> Plan:
     return Plan(
-        methods=tuple(methods), env_ids=tuple(env_ids), seeds=tuple(args.seeds),
+        methods=tuple(specs), env_ids=tuple(env_ids), seeds=tuple(args.seeds),
         encoder_seeds=tuple(args.encoder_seeds or args.seeds), algo=args.algo, n_transitions=args.n_transitions,
         n_timesteps=args.n_timesteps, eval_freq=args.eval_freq, eval_episodes=args.eval_episodes,
         n_eval_envs=args.n_eval_envs, final_episodes=final_episodes, params=tuple(args.params),
@@ -101,7 +103,7 @@ def _engine(args: argparse.Namespace) -> Engine:
 
 
 def _run(args: argparse.Namespace) -> None:
-    plan = _plan(args, args.methods, args.env, args.final_episodes)
+    plan = _plan(args, args.methods or list(methods()), args.env, args.final_episodes)
     jobs, root = build(plan), Path(args.output)
     if args.dry_run:
         _list(root, jobs)
@@ -125,7 +127,7 @@ def _list(root: Path, jobs: list[Job]) -> None:
         state = "done" if is_done(root, job.to_json()) else "missing"
         if state == "done" and is_by_other_code(root, job.to_json()):
             state = "other code"
-        print(f"{state:11}{job.name}  {job.title}\n           python -m {' '.join(job.command)}")
+        print(f"{state:11}{job.name}  {job.title}\n{'':11}{command_line(job.command)}")
 
 
 def _require_report() -> None:
@@ -147,8 +149,8 @@ def _report_parser() -> argparse.ArgumentParser:
                         help="learning curves from the zoo's evaluations or from the training episodes")  # fmt: skip
     parser.add_argument("--reference", help="the method that the others are compared with (default: abisim)")
     parser.add_argument("--thresholds", nargs="+", type=_threshold, metavar="NUMBER|METHOD",
-                        help="normalized returns, 0 (never at the goal) to 1, or methods, whose last return is meant "
-                        "(default: 0.5 0.7 0.9, and vanilla if it is there)")  # fmt: skip
+                        help="normalized returns, 0 (the lowest) to 1 (the highest), or methods, for their final "
+                        "return (default: 0.5 0.7 0.9, and vanilla if it is there)")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
     return parser
 
@@ -171,7 +173,7 @@ def _report(args: argparse.Namespace) -> None:
 def _evaluate_parser() -> argparse.ArgumentParser:
     parser = make_parser(
         "benchmark evaluate",
-        "Evaluate the final model of a zoo run.",
+        "Evaluate the final model of a zoo run, deterministically and stochastically, on every split.",
         "benchmark evaluate logs/ppo/PointMaze-v0_1",
     )
     parser.add_argument("folder", metavar="RUN", help="a zoo run folder")
@@ -186,7 +188,7 @@ def _evaluate(args: argparse.Namespace) -> None:
 def _export_parser() -> argparse.ArgumentParser:
     parser = make_parser(
         "benchmark export",
-        "Copy what the report reads, without models and training episodes, to be committed or sent.",
+        "Copy what the report reads, without models and training episodes, small enough to be committed.",
         "benchmark export benchmark -o results/benchmark",
     )
     parser.add_argument("folder", metavar="DIR", help="a benchmark's folder, or a zoo log folder")
@@ -207,10 +209,10 @@ def _sweep_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("-o", "--output", default="sweep", metavar="DIR", help="folder; a benchmark's will do")
     parser.add_argument("--method", default="abisim", metavar="METHOD[,frozen]", help="to pretrain (default: abisim)")
-    parser.add_argument("--env", required=True, metavar="ID", help=f"one of {', '.join(ENV_IDS)}")
+    parser.add_argument("--env", required=True, metavar="ID", help="a registered id")
     parser.add_argument("--space", required=True, nargs="+", metavar="NAME=VALUES",
                         help="what to search: objective_kwargs.c=0.5..0.99 learning_rate=1e-4..1e-3:log "
-                        "objective_kwargs.pairs=random|near; ssi.NAME=VALUES for the base's")  # fmt: skip
+                        "objective_kwargs.pairs=random|nearest; ssi.NAME=VALUES for the base's")  # fmt: skip
     parser.add_argument("--n-trials", type=int, default=20, help="(default: 20)")
     parser.add_argument("--batch", type=int, default=1, help="trials proposed at a time (default: 1)")
     parser.add_argument("--metric", choices=("final", "area"), default="final",
@@ -240,10 +242,10 @@ def _sweep(args: argparse.Namespace) -> None:
 
 
 def _comparing_command(args: argparse.Namespace, words: Sequence[str]) -> str:
-    """A benchmark of the best trial beside learning from scratch, in the sweep's folder and with its budget."""
+    """A benchmark of the best trial and of learning from scratch, in the sweep's folder and with its budget."""
     command = [PROGRAM, "benchmark", "-o", args.output, "--env", args.env]
     command += ["--methods", args.method, "vanilla", "--seeds", *map(str, args.seeds)]
-    names = "encoder_seeds algo n_transitions n_timesteps eval_freq eval_episodes n_eval_envs params"
+    names = "encoder_seeds algo n_transitions n_timesteps eval_freq eval_episodes n_eval_envs params packages"
     for name in names.split():
         value = getattr(args, name)
         if value:

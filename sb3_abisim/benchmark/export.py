@@ -1,7 +1,7 @@
 """Copy of a benchmark that is small enough to commit: what the report reads, and how each job was made.
 
-Models, datasets, encoders and monitor files stay behind, and so do the names of the folders that they lay in. Of the
-training episodes the curve stays.
+Models, datasets, encoders and monitor files are left out, and so are the names of the folders that they were in. Of the
+training episodes the curve is kept.
 """
 
 import io

@@ -1,9 +1,9 @@
 """Search pretraining settings by what they do for the agents that are trained on the encoders.
 
-Optuna proposes, the jobs of a benchmark answer: a trial is an encoder per encoder seed and a run per RL seed. Nothing
-is kept besides the jobs. The sampler is seeded, so that the same command proposes the same trials again, finds those
-that are done by the names of their jobs, and goes on where it was stopped (with the same version of Optuna, whose
-sampler decides).
+Optuna proposes trials. A trial is an encoder per encoder seed and a run per RL seed, made by the jobs of a benchmark.
+Nothing is kept besides the jobs. The sampler is seeded, so that the same command proposes the same trials again, finds
+those that are done by the names of their jobs, and goes on where it was stopped. That holds for one version of Optuna,
+whose sampler decides.
 """
 
 import csv
@@ -17,12 +17,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_abisim.benchmark.jobs.job import is_done
+from sb3_abisim.benchmark.graph import build
+from sb3_abisim.benchmark.jobs.job import Job, is_done
 from sb3_abisim.benchmark.jobs.local import Engine, run_jobs
-from sb3_abisim.benchmark.plan import Job, Plan, build
+from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_objective, methods
+from sb3_abisim.zoo.methods import MethodSpec
 from sb3_abisim.zoo.runs import Curve, read_run
 
 if TYPE_CHECKING:
@@ -62,7 +64,7 @@ def parse_space(words: Sequence[str], objective: str) -> dict[str, "BaseDistribu
     """Read what to search: a range of integers if both ends are, else of numbers, or choices.
 
     :param words: such as ``objective_kwargs.c=0.5..0.99``, ``learning_rate=1e-4..1e-3:log``,
-        ``objective_kwargs.pairs=random|near``; ``ssi.batch_size=64..512`` for a setting of the base
+        ``objective_kwargs.pairs=random|nearest``; ``ssi.batch_size=64..512`` for a setting of the base
     :param objective: whose settings those are that name none
     :return: setting, with its objective in front, to Optuna's distribution
     :raises ValueError: for a word that cannot be read
@@ -123,8 +125,11 @@ def sweep(
 
     if len(plan.methods) != 1 or len(plan.env_ids) != 1:
         raise ValueError(f"a sweep takes one method and one environment, got {plan.methods} and {plan.env_ids}")
-    objective = plan.methods[0].partition(",")[0]
+    spec = MethodSpec.parse(plan.methods[0])
+    objective = spec.name
     get_objective(objective)
+    if spec.encoder is not None:
+        raise ValueError(f"a sweep pretrains an encoder for each trial; give {objective} without ={spec.encoder}")
     for name, count in (("n_trials", n_trials), ("batch", batch)):
         if count < 1:
             raise ValueError(f"{name} must be at least 1, got {count}")

@@ -85,11 +85,11 @@ def run(
         import_packages(args.packages)
         code = function(args)
     except (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, ImportError) as error:
-        parser.error(one_line(error))
+        parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
     except (OSError, FloatingPointError) as error:
         parser.exit(1, f"{parser.prog}: {one_line(error)}\n")
     except ValueError as error:
-        parser.error(one_line(error))
+        parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
     except KeyboardInterrupt:
         parser.exit(130, f"{parser.prog}: {interrupted}\n")
     if code:

@@ -1,8 +1,8 @@
 """Files that are either whole or absent, and folders with one writer at a time.
 
 A process may be killed between any two instructions. :func:`write_atomic` therefore writes under a temporary name and
-renames at the end; a reader sees the old file or the new one. :func:`folder_lock` is a lock of the system, which lets go
-of it when its holder dies, so that a kill leaves nothing to clean up by hand.
+renames at the end; a reader sees the old file or the new one. :func:`folder_lock` is a lock of the system, which frees
+it when its holder dies, so that a kill leaves nothing to clean up by hand.
 """
 
 import contextlib
@@ -103,7 +103,7 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
             lock.acquire(blocking=False)
             break
         except Timeout:
-            # A holder removes the file when it ends: what could not be locked may no longer be what the name stands for.
+            # A holder removes the file when it ends: the name may no longer stand for what could not be locked.
             if not lock_path.exists():
                 continue
         try:

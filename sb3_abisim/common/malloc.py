@@ -9,9 +9,9 @@ _INT_MAX = 2**31 - 1
 
 
 def keep_freed_memory() -> bool:
-    """Tell glibc to keep what the process has freed; costs some resident memory, changes no result.
+    """Make glibc keep what the process has freed; costs some resident memory, changes no result.
 
-    A minibatch of pictures takes tens of megabytes at every layer. By default, glibc gives blocks of that size back
+    A minibatch of observations takes tens of megabytes at every layer. By default, glibc gives blocks of that size back
     to the system when they are freed, and every new one is mapped and zeroed page by page when it is first written
     to, which can take longer than the arithmetic on it. The effect is that of the environment variables
     ``MALLOC_MMAP_MAX_=0`` and ``MALLOC_TRIM_THRESHOLD_=2147483647``.

@@ -13,10 +13,10 @@ ArrayT = TypeVar("ArrayT", bound=Any)
 class TransitionBatch(Generic[ArrayT]):
     """B transitions (s_t, a_t, s_{t+k}).
 
-    :param frames: (m, C, H, W); uint8 in 0..255, or float in 0..1 after SB3's ``preprocess_obs``. Those that several
-        transitions share stand once
-    :param actions: a_t: int64 (B,) for ``Discrete``, float32 (B, action_dim) for ``Box``; as sequences a_t to a_{t+k-1},
-        with a second dimension k
+    :param frames: the observations, (m, C, H, W); uint8 in 0..255, or float in 0..1 after SB3's ``preprocess_obs``.
+        One that several transitions share stands there once
+    :param actions: a_t: int64 (B,) for ``Discrete``, float32 (B, action_dim) for ``Box``; sequences a_t to a_{t+k-1}
+        have a second dimension k
     :param obs_index: where s_t stands among the frames, int64 (B,) or a slice
     :param next_obs_index: where s_{t+k} stands among them
     """
@@ -28,20 +28,16 @@ class TransitionBatch(Generic[ArrayT]):
 
     @classmethod
     def of(cls, obs: ArrayT, actions: ArrayT, next_obs: ArrayT) -> "TransitionBatch[ArrayT]":
-        """A batch of transitions that share no frame.
+        """A batch of tensors, of transitions that share no frame.
 
         :param obs: s_t, (B, C, H, W)
         :param actions: see the class
         :param next_obs: s_{t+k}, (B, C, H, W)
         """
-        n = len(obs)
-        if isinstance(obs, np.ndarray):
-            frames: Any = np.concatenate([obs, next_obs])
-        else:
-            import torch as th
+        import torch as th
 
-            frames = th.cat([obs, next_obs])
-        return cls(frames, actions, slice(None, n), slice(n, None))
+        frames: Any = th.cat([obs, next_obs])
+        return cls(frames, actions, slice(None, len(obs)), slice(len(obs), None))
 
     @property
     def obs(self) -> ArrayT:

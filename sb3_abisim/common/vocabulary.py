@@ -22,6 +22,10 @@ _VALUES = {
 }
 # Keyword arguments of environments.
 _ENV_KWARGS = {"recolour": "color_jitter"}
+# Fields of a scan map, and its settings.
+_SCAN_MAP = {"metres_per_pixel": "meters_per_pixel"}
+# What a model card says of its dataset.
+_DATASET = {"digest": "hash", "fingerprint": "content_hash"}
 # Prefixes and terms of logs.
 _PREFIXES = {"test": "eval"}
 _TERMS = {"prediction": "inverse_nll", "contrast": "info_nce", "metric": "metric_loss"}
@@ -49,6 +53,23 @@ def current_env_kwargs(env_kwargs: dict[str, Any]) -> dict[str, Any]:
     :param env_kwargs: as a file holds them, or today's
     """
     return {_ENV_KWARGS.get(name, name): value for name, value in env_kwargs.items()}
+
+
+def current_scan_map(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields or settings of a scan map under today's names.
+
+    :param fields: as a file holds them, or today's
+    """
+    return {_SCAN_MAP.get(name, name): value for name, value in fields.items()}
+
+
+def current_dataset(dataset: dict[str, Any]) -> dict[str, Any]:
+    """What a model card says of its dataset, under today's names.
+
+    :param dataset: as a file holds it, or today's
+    """
+    named = {_DATASET.get(name, name): value for name, value in dataset.items()}
+    return {**named, "env_kwargs": current_env_kwargs(named["env_kwargs"])}
 
 
 def current_term(name: str) -> str:

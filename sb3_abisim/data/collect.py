@@ -1,7 +1,7 @@
 """Collect random-action transitions into a dataset: ``sb3-abisim collect --env ID -n N -o DIR``.
 
-Shard k follows from ``SeedSequence(seed, spawn_key=(k,))`` alone: environments are reset at its start, actions are
-uniform. Resuming after a kill, extending a dataset and repairing a damaged shard are therefore the same thing: collect
+Shard k follows from ``SeedSequence(seed, spawn_key=(k,))`` alone: environments are reset at its start, and actions are
+uniform. To resume after a kill, to extend a dataset and to repair a damaged shard are therefore the same thing: collect
 the shards that are not there. The same command gives the same bytes, whatever happened in between.
 """
 
@@ -26,8 +26,8 @@ from sb3_abisim.common.spaces import space_to_json
 from sb3_abisim.data.format import (
     CONTENT_HASH_KEY,
     CUT,
-    DRAWN_FORMAT_VERSION,
     FORMAT_VERSION,
+    RENDERED_FORMAT_VERSION,
     TERMINATED,
     TRUNCATED,
     check_spaces,
@@ -61,7 +61,7 @@ def collect(
     :param n_envs: environments stepped together; part of what determines the data
     :param env_kwargs: passed to the environment, JSON types
     :param progress: show a progress bar on stderr
-    :return: the dataset's digest
+    :return: the dataset's hash
     :raises ValueError: for mistakes in the arguments, naming the remedy
     :raises OSError: ``errno.ENOSPC`` for a full disk; the same call goes on once there is space
     """
@@ -97,7 +97,7 @@ def _collect(
     env.reset(seed=seed)  # factors need a state; every shard resets again
     steps = _steps_per_shard(env, env_id, env_kwargs)
     identity = {
-        "format_version": DRAWN_FORMAT_VERSION if _draws_factors(env) else FORMAT_VERSION,
+        "format_version": RENDERED_FORMAT_VERSION if _renders_factors(env) else FORMAT_VERSION,
         "env_id": env_id,
         "env_kwargs": env_kwargs,
         "observation_space": space_to_json(observation_space),
@@ -134,7 +134,7 @@ def _collect(
         hash = writer.finish(n_shards)
     if progress:
         state = "already complete, nothing to do" if was_finished and not written else "complete"
-        print(f"{folder}: {n_transitions} transitions of {env_id}, {state} (digest {hash[:16]})")
+        print(f"{folder}: {n_transitions} transitions of {env_id}, {state} (hash {hash[:16]})")
     return hash
 
 
@@ -158,14 +158,14 @@ def collect_shard(
     reset_seed, action_seed = seed.spawn(2)
     actions = _random_actions(env.single_action_space, (n_steps, n_envs), np.random.default_rng(action_seed))
     observation, _ = env.reset(seed=reset_seed.generate_state(n_envs).tolist())
-    # Frames that can be drawn again are not kept.
-    drawn = _draws_factors(env)
-    observations, factors = [] if drawn else [observation], [_factors(env)]
+    # Frames that can be rendered again are not kept.
+    rendered = _renders_factors(env)
+    observations, factors = [] if rendered else [observation], [_factors(env)]
     # Per copy: (steps taken at the episode's end, how it ended, last frame, last factors).
     endings: list[list[_Ending]] = [[] for _ in range(n_envs)]
     for t in range(kept.max()):
         observation, _, terminated, truncated, infos = env.step(actions[t])
-        if not drawn:
+        if not rendered:
             observations.append(observation)
         factors.append(_factors(env))
         for j in np.flatnonzero((terminated | truncated) & (t < kept)):
@@ -178,10 +178,10 @@ def collect_shard(
     for i, n in enumerate(kept.tolist()):
         begin = 0
         if n and (not endings[i] or endings[i][-1][0] < n):
-            last_frame = None if drawn else observations[n][i]
+            last_frame = None if rendered else observations[n][i]
             endings[i].append((n, CUT, last_frame, {name: array[n, i] for name, array in states.items()}))
         for stop, end, last_frame, last in endings[i]:
-            frames = None if drawn else [observations[t][i] for t in range(begin, stop)] + [last_frame]
+            frames = None if rendered else [observations[t][i] for t in range(begin, stop)] + [last_frame]
             rows = {
                 name: np.concatenate([array[begin:stop, i], np.asarray(last[name], array.dtype)[None]])
                 for name, array in states.items()
@@ -197,7 +197,8 @@ _Ending = tuple[int, int, NDArray[np.uint8] | None, dict[str, Any]]
 def make_vector_env(env_id: str, n_envs: int, env_kwargs: dict[str, Any]) -> VectorEnv[Any, Any, Any]:
     """Copies of a registered environment that reset within the step that ends an episode.
 
-    :param env_id: ours, or any other registered one, which then runs as a ``SyncVectorEnv``
+    :param env_id: a registered one; those that are no :class:`~sb3_abisim.envs.base.BatchEnv` run as a
+        ``SyncVectorEnv``
     :param n_envs: number of copies
     :param env_kwargs: passed to the environment
     :raises ValueError: for an unknown id, or if the environment refuses ``env_kwargs``
@@ -205,7 +206,7 @@ def make_vector_env(env_id: str, n_envs: int, env_kwargs: dict[str, Any]) -> Vec
     spec = gym.registry.get(env_id)
     if spec is None:
         close = difflib.get_close_matches(env_id, gym.registry, n=3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"ours are {', '.join(ENV_IDS)}"
+        hint = f"did you mean {' or '.join(close)}?" if close else f"known are {', '.join(ENV_IDS)}"
         raise ValueError(f"unknown environment {env_id!r}: {hint} (--packages imports what registers others)")
     try:
         if batch_class(env_id) is not None:
@@ -218,7 +219,7 @@ def make_vector_env(env_id: str, n_envs: int, env_kwargs: dict[str, Any]) -> Vec
 
 
 def _copy_observations(env: gym.Env[Any, Any]) -> gym.Wrapper[Any, Any, Any, Any]:
-    """For environments that draw into the array that they returned before: its last frame would be the next first."""
+    """For environments that write into the array that they returned before: its last frame would be the next first."""
     return gym.wrappers.TransformObservation(env, np.copy, env.observation_space)
 
 
@@ -227,9 +228,9 @@ def _factors(env: VectorEnv[Any, Any, Any]) -> dict[str, NDArray[Any]]:
     return unwrapped.factors() if isinstance(unwrapped, BatchEnv) else {}
 
 
-def _draws_factors(env: VectorEnv[Any, Any, Any]) -> bool:
+def _renders_factors(env: VectorEnv[Any, Any, Any]) -> bool:
     unwrapped = env.unwrapped
-    return isinstance(unwrapped, BatchEnv) and unwrapped.draws_factors
+    return isinstance(unwrapped, BatchEnv) and unwrapped.renders_factors
 
 
 def _content_hash(env: VectorEnv[Any, Any, Any]) -> str | None:
@@ -244,7 +245,7 @@ def _steps_per_shard(env: VectorEnv[Any, Any, Any], env_id: str, env_kwargs: dic
     given = int(env_kwargs.get("max_episode_steps") or spec.max_episode_steps or 0)
     limit = max(1, given)  # -1 is Gymnasium's word for none; it refuses other numbers below 1
     row = math.prod(env.single_observation_space.shape or ())
-    if _draws_factors(env):
+    if _renders_factors(env):
         row = sum(array[0].nbytes for array in _factors(env).values())
     steps = max(1, min(SHARD_TRANSITIONS, MAX_SHARD_BYTES // row) // (env.num_envs * limit)) * limit
     if steps * env.num_envs * row > MAX_SHARD_BYTES:
@@ -273,7 +274,7 @@ def _random_actions(space: gym.Space[Any], shape: tuple[int, int], generator: np
 def main(argv: Sequence[str] | None = None) -> None:
     """The command; see ``--help``.
 
-    :param argv: arguments, None for those of the process
+    :param argv: its arguments; None for those of the process
     """
     parser = make_parser(
         "collect",

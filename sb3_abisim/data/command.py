@@ -1,6 +1,7 @@
-"""``sb3-abisim data``: datasets from other formats, and to Minari."""
+"""``sb3-abisim data import`` and ``data export``: datasets from other formats, and to Minari."""
 
 import argparse
+import sys
 from collections.abc import Sequence
 
 from sb3_abisim.common.cli import make_parser, run
@@ -10,28 +11,55 @@ from sb3_abisim.registry import get_reader
 def main(argv: Sequence[str] | None = None) -> None:
     """The command; see ``--help``.
 
-    :param argv: arguments, None for those of the process
+    :param argv: its arguments; None for those of the process
     """
-    parser = make_parser(
-        "data", "Exchange datasets with other formats.", "data import minari nav2d/random-v0 -o data/nav2d"
-    )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="import | export")
-    importer = commands.add_parser("import", help="make a dataset folder of what something else has written")
-    importer.add_argument("reader", metavar="READER", help="name of a reader, such as minari")
-    importer.add_argument("source", metavar="SOURCE", help="what it reads, such as the id of a Minari dataset")
-    importer.add_argument("-o", "--output", required=True, metavar="DIR", help="the dataset's folder")
-    export = commands.add_parser("export", help="write a dataset folder into Minari's local store")
-    export.add_argument("folder", metavar="DIR", help="a dataset's folder")
-    export.add_argument("dataset_id", metavar="DATASET_ID", help="such as nav2d/random-v0")
-    run(parser, argv, _command)
-
-
-def _command(args: argparse.Namespace) -> None:
-    if args.command == "import":
-        hash = get_reader(args.reader).read_fn(args.source, args.output)
-        print(f"{args.output}: imported from {args.source} (digest {hash[:16]}); rewards were dropped")
+    words = sys.argv[1:] if argv is None else list(argv)
+    if not words or words[0] not in COMMANDS:
+        # Help, or an error that lists the commands.
+        example = "data import minari nav2d/random-v0 -o data/nav2d"
+        parser = make_parser("data", "Exchange datasets with other formats.", example)
+        commands = parser.add_subparsers(dest="command", required=True, metavar="import | export")
+        commands.add_parser("import", help="make a dataset folder of what something else has written")
+        commands.add_parser("export", help="write a dataset folder into Minari's local store")
+        parser.parse_args(words)
         return
+    make, function = COMMANDS[words[0]]
+    run(make(), words[1:], function)
+
+
+def _import_parser() -> argparse.ArgumentParser:
+    parser = make_parser(
+        "data import",
+        "Make a dataset folder of what something else has written; rewards are dropped.",
+        "data import minari nav2d/random-v0 -o data/nav2d",
+    )
+    parser.add_argument("reader", metavar="READER", help="name of a reader, such as minari")
+    parser.add_argument("source", metavar="SOURCE", help="what it reads, such as the id of a Minari dataset")
+    parser.add_argument("-o", "--output", required=True, metavar="DIR", help="the dataset's folder")
+    return parser
+
+
+def _import(args: argparse.Namespace) -> None:
+    hash = get_reader(args.reader).read_fn(args.source, args.output)
+    print(f"{args.output}: imported from {args.source} (hash {hash[:16]}); rewards were dropped")
+
+
+def _export_parser() -> argparse.ArgumentParser:
+    parser = make_parser(
+        "data export",
+        "Write a dataset folder into Minari's local store (MINARI_DATASETS_PATH).",
+        "data export data/nav2d nav2d/random-v0",
+    )
+    parser.add_argument("folder", metavar="DIR", help="a dataset's folder")
+    parser.add_argument("dataset_id", metavar="ID", help="such as nav2d/random-v0")
+    return parser
+
+
+def _export(args: argparse.Namespace) -> None:
     from sb3_abisim.data.readers.minari import export_dataset
 
     export_dataset(args.folder, args.dataset_id)
     print(f"{args.dataset_id}: exported from {args.folder}; rewards were not recorded and are all 0")
+
+
+COMMANDS = {"import": (_import_parser, _import), "export": (_export_parser, _export)}

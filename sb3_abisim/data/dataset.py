@@ -1,7 +1,7 @@
 """Reads datasets: memory-mapped transitions (s_t, a_t, s_{t+k}) that never cross an episode's end.
 
-Nothing that grows with the pictures is loaded; per frame, the reader keeps 5 bytes plus the size of an action. Pages of
-the files that were read count as this process's memory until they are given back, which happens now and then.
+No frames are loaded. Per frame, the reader keeps 5 bytes plus the size of an action. Pages of the files that were read
+count as this process's memory until they are given back, which happens now and then.
 """
 
 import mmap
@@ -42,7 +42,7 @@ _VERIFIED: set[tuple[str, int, int, str]] = set()
 # Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbors with it, so
 # that up to twenty times as much was resident meanwhile. Pages stay in its cache: reading them again is cheap.
 RELEASE_AFTER_BYTES = 16 * 2**20
-# Which segments are held out is a property of the dataset, not of a run.
+# Which segments make up the eval split is a property of the dataset, not of a run.
 _SPLIT_SEED = 20240229
 
 Split = Literal["train", "eval"]
@@ -60,7 +60,7 @@ class TransitionDataset:
     :param verify: True compares every file with its sha256, False only sizes; None does so once per process for
         datasets below ``VERIFY_BELOW_BYTES``
     :raises DatasetError: if the folder is not a finished dataset, or is damaged, or has no frames and the scenes that
-        they would be drawn from are not the same any more
+        they would be rendered from are not the same any more
     """
 
     def __init__(self, path: str | os.PathLike[str], eval_fraction: float = 0.05, verify: bool | None = None) -> None:
@@ -77,11 +77,11 @@ class TransitionDataset:
         self.observation_space: spaces.Box = space_from_json(self.meta["observation_space"])  # type: ignore[assignment]
         self.action_space = space_from_json(self.meta["action_space"])
         self._check_files(verify)
-        self._draw: Callable[[dict[str, NDArray[Any]]], NDArray[np.uint8]] | None = None
+        self._render_fn: Callable[[dict[str, NDArray[Any]]], NDArray[np.uint8]] | None = None
         if not holds_frames(self.meta):
-            from sb3_abisim.data.rendering import make_drawer
+            from sb3_abisim.data.rendering import make_render_fn
 
-            self._draw = make_drawer(self.path, self.meta)
+            self._render_fn = make_render_fn(self.path, self.meta)
         frames_per_shard = [shard["n_frames"] for shard in self.meta["shards"]]
         # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
         self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
@@ -120,8 +120,8 @@ class TransitionDataset:
         starts = np.flatnonzero(self._has_steps(k, split))
         if not len(starts):
             raise ValueError(
-                f"no transition of {k} steps in split {split!r} of {self.path} ({len(self._last)} segments, eval_fraction "
-                f"{self.eval_fraction}); collect more transitions or use split=None"
+                f"no transition of {k} steps in split {split!r} of {self.path} ({len(self._last)} segments, "
+                f"eval_fraction {self.eval_fraction}); collect more transitions or use split=None"
             )
         return starts
 
@@ -184,9 +184,9 @@ class TransitionDataset:
 
         The order is a function of (seed, epoch) alone, so that a position in training is two integers.
 
-        With ``chunk_length`` above 1, chunks of transitions that follow each other in an episode are shuffled instead of
-        single ones. A frame then ends one transition and begins the next, so that little more than half as many have to
-        be read and embedded. Where episodes are cut into runs is drawn anew for each pass.
+        With ``chunk_length`` above 1, chunks of transitions that follow each other in an episode are shuffled instead
+        of single ones. A frame then ends one transition and begins the next, so that little more than half as many have
+        to be read and embedded. Where episodes are cut into chunks is sampled for each pass.
 
         :param batch_size: transitions per batch
         :param k: steps between the two observations, or the fewest and the most of them
@@ -195,7 +195,7 @@ class TransitionDataset:
         :param start: batches to skip
         :param split: see :meth:`valid_starts`
         :param sequences: whether actions are all k between the two frames, instead of the first
-        :param chunk_length: transitions per chunk, at least 1; with a range of steps, frames that transitions start from
+        :param chunk_length: transitions per chunk, at least 1; with a range of steps, frames that transitions start at
         :raises ValueError: if there are fewer transitions than one batch takes
         """
         if sequences and not isinstance(k, int):
@@ -210,7 +210,7 @@ class TransitionDataset:
         starts, steps = self.pairs(k, split)
         if len(starts) < batch_size:
             raise ValueError(f"batch_size {batch_size} exceeds the {len(starts)} transitions of {k} steps; lower it")
-        # Drawn now and not at the first batch, so that mistakes raise here.
+        # Sampled now and not at the first batch, so that mistakes raise here.
         generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch])))
         order = (
             generator.permutation(len(starts)) if chunk_length == 1 else self._shuffle(starts, chunk_length, generator)
@@ -220,14 +220,14 @@ class TransitionDataset:
     def _shuffle(
         self, starts: NDArray[np.int64], chunk_length: int, generator: np.random.Generator
     ) -> NDArray[np.int64]:
-        """An order of transitions in which those of a run stay together."""
+        """An order of transitions in which those of a chunk stay together."""
         lengths = np.diff(self._last, prepend=-1)
-        # Each segment is cut at multiples of run_length, counted from a place before its beginning.
+        # Each segment is cut at multiples of chunk_length, counted from a place before its beginning.
         before = generator.integers(chunk_length, size=len(lengths))
         position = np.arange(self.n_frames) - np.repeat(self._last + 1 - lengths - before, lengths)
         begins = (position % chunk_length == 0) | (np.roll(self._ends, 1) != INSIDE)
-        run = np.cumsum(begins)[starts]
-        return np.argsort(generator.permutation(run.max() + 1)[run], kind="stable")
+        chunk = np.cumsum(begins)[starts]
+        return np.argsort(generator.permutation(chunk.max() + 1)[chunk], kind="stable")
 
     def _iterate(
         self,
@@ -261,7 +261,7 @@ class TransitionDataset:
         return array.astype(np.int64)
 
     def _frames(self, index: NDArray[np.int64]) -> NDArray[np.uint8]:
-        return self._gather("frames", index) if self._draw is None else self._draw(self._factors(index))
+        return self._gather("frames", index) if self._render_fn is None else self._render_fn(self._factors(index))
 
     def _factors(self, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
@@ -305,7 +305,7 @@ class TransitionDataset:
         try:
             array = np.load(path, mmap_mode=mmap_mode, allow_pickle=False)
         except ValueError as error:
-            raise DatasetError(f"{path} is not an array file of ours: {error}") from None
+            raise DatasetError(f"{path} is not an array file of a dataset: {error}") from None
         expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
         if array.dtype != dtype or array.shape != expected:
             raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
@@ -319,9 +319,9 @@ class TransitionDataset:
     def _in_eval(self) -> NDArray[np.bool_]:
         """Per frame, whether its segment belongs to the split "eval"."""
         n_segments = len(self._last)
-        n_test = min(n_segments - 1, max(1, round(self.eval_fraction * n_segments))) if self.eval_fraction else 0
+        n_eval = min(n_segments - 1, max(1, round(self.eval_fraction * n_segments))) if self.eval_fraction else 0
         chosen = np.zeros(n_segments, dtype=bool)
-        chosen[np.random.Generator(np.random.PCG64(_SPLIT_SEED)).permutation(n_segments)[:n_test]] = True
+        chosen[np.random.Generator(np.random.PCG64(_SPLIT_SEED)).permutation(n_segments)[:n_eval]] = True
         return np.repeat(chosen, np.diff(self._last, prepend=-1))
 
     def _check_files(self, verify: bool | None) -> None:
@@ -348,7 +348,7 @@ class TransitionDataset:
         shard_ends = self._offsets[1:] - 1
         fits = self.n_frames == self._offsets[-1] == self.n_transitions + len(self._last)
         if not fits or self._ends.max() > CUT or (self._ends[shard_ends] == INSIDE).any():
-            raise DatasetError(f"the episode ends of {self.path} contradict its meta.json; it was not written by us")
+            raise DatasetError(f"the episode ends of {self.path} contradict its meta.json; it is damaged or forged")
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
@@ -363,13 +363,13 @@ def _read_meta(path: Path) -> dict[str, Any]:
         check_meta(meta)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         remedy = "run the command that made the dataset again, in a new folder if it refuses"
-        raise DatasetError(f"{path / META_NAME} is damaged or not ours: {error}; {remedy}") from None
+        raise DatasetError(f"{path / META_NAME} is damaged, or not that of a dataset: {error}; {remedy}") from None
     return meta
 
 
 def _repair(path: Path, meta: dict[str, Any]) -> str:
     if meta["source"] is not None:
-        return f"remove {path} and import it again from Minari ({meta['source']})"
+        return f"remove {path} and import it again from its source, {meta['source']}"
     return (
         "run the command that collected it again, which collects damaged shards anew: sb3-abisim collect "
         f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} "

@@ -1,4 +1,4 @@
-"""What a dataset folder holds: file names, manifests, hashes; shared by the reader and the writer.
+"""What a dataset folder holds: file names, manifests, hashes. The reader and the writer share it.
 
     config.json          what identifies the collection, written first
     frames-00000.npy     uint8 [F, C, H, W]: the frames of one segment after another, L + 1 frames for L transitions
@@ -8,8 +8,8 @@
     shard-00000.json     sizes and hashes of the shard's files, written after them
     meta.json            everything above in one document, written last: without it the dataset is unfinished
 
-In the format of version 2 there are no frames: they are drawn from the factors when they are read, by the environment
-that env_id and env_kwargs name, whose fingerprint must be the same. All else is as in version 1.
+In the format of version 2 there are no frames. They are rendered from the factors when they are read, by the
+environment that env_id and env_kwargs name, whose content hash must be the same. All else is as in version 1.
 
 A segment is an episode, or the part of one that a shard's end cuts off. All documents are free of times and host names,
 so that the same command writes the same bytes.
@@ -29,15 +29,15 @@ from numpy.typing import NDArray
 from sb3_abisim.common.spaces import is_channels_first
 
 FORMAT_VERSION = 1
-# Without frames, for environments that can draw them from the factors.
-DRAWN_FORMAT_VERSION = 2
-# Keys of meta.json, and of config.json: the dataset's hash, that of its own document, and the environment's content hash.
-HASH_KEY, CHECKSUM_KEY, CONTENT_HASH_KEY = "digest", "checksum", "fingerprint"
+# Without frames, for environments that can render them from the factors.
+RENDERED_FORMAT_VERSION = 2
+# Keys of meta.json: hashes of the dataset, of the document, and (also in config.json) of the environment's content.
+HASH_KEY, DOCUMENT_HASH_KEY, CONTENT_HASH_KEY = "digest", "checksum", "fingerprint"
 CONFIG_NAME = "config.json"
 META_NAME = "meta.json"
 # Values of the ends array.
 INSIDE, TERMINATED, TRUNCATED, CUT = range(4)
-# The keys of config.json that a dataset's digest covers; its remaining key, "versions", only informs.
+# The keys of config.json that a dataset's hash covers; its remaining key, "versions", only informs.
 IDENTITY_KEYS = (
     "format_version",
     "env_id",
@@ -70,7 +70,7 @@ def array_names(identity: dict[str, Any]) -> tuple[str, ...]:
 
 
 def holds_frames(identity: dict[str, Any]) -> bool:
-    """Whether the shards hold frames; if not, they are drawn from the factors.
+    """Whether the shards hold frames; if not, they are rendered from the factors.
 
     :param identity: as for :func:`array_names`
     """
@@ -227,8 +227,8 @@ def make_meta(config: dict[str, Any], shards: list[dict[str, Any]]) -> dict[str,
         "shards": shards,
         HASH_KEY: _sha256(hashed),
     }
-    # The digest leaves the versions out; this sum covers every character that means something.
-    return meta | {CHECKSUM_KEY: _sha256(meta)}
+    # The dataset's hash leaves the versions out; this one covers every character that means something.
+    return meta | {DOCUMENT_HASH_KEY: _sha256(meta)}
 
 
 def check_meta(meta: dict[str, Any]) -> None:
@@ -237,17 +237,17 @@ def check_meta(meta: dict[str, Any]) -> None:
     :param meta: the content of meta.json
     :raises ValueError: with the reason
     """
-    known = FORMAT_VERSION, DRAWN_FORMAT_VERSION
+    known = FORMAT_VERSION, RENDERED_FORMAT_VERSION
     if meta.get("format_version") not in known:
         raise ValueError(f"format version {meta.get('format_version')!r}, this version reads {known}")
-    if set(meta) != {*IDENTITY_KEYS, "versions", "n_transitions", "n_frames", "shards", HASH_KEY, CHECKSUM_KEY}:
+    if set(meta) != {*IDENTITY_KEYS, "versions", "n_transitions", "n_frames", "shards", HASH_KEY, DOCUMENT_HASH_KEY}:
         raise ValueError("its keys are not those of a dataset")
     check_factor_layout(meta["factors"])
     config = {key: meta[key] for key in (*IDENTITY_KEYS, "versions")}
     if not all(is_shard_manifest(shard, k, meta) for k, shard in enumerate(meta["shards"])):
         raise ValueError("its list of shards is not one")
     if make_meta(config, meta["shards"]) != meta:
-        raise ValueError("its checksum does not match")
+        raise ValueError("its hash does not match")
 
 
 def _sha256(document: dict[str, Any]) -> str:

@@ -1,28 +1,42 @@
 """Writes dataset folders so that a kill at any moment loses at most the shard in flight."""
 
 import contextlib
+import dataclasses
 import io
+import itertools
+import json
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+import os
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_abisim._version import __version__
 from sb3_abisim.common.files import LOCK_NAME, file_hash, folder_lock, is_temporary, remove_temporaries, write_atomic
+from sb3_abisim.common.spaces import space_to_json
+from sb3_abisim.common.vocabulary import current_env_kwargs
 from sb3_abisim.data.format import (
     CONFIG_NAME,
+    CONTENT_HASH_KEY,
+    CUT,
+    FORMAT_VERSION,
     HASH_KEY,
     IDENTITY_KEYS,
     META_NAME,
+    TERMINATED,
+    TRUNCATED,
     DatasetError,
     array_file,
     array_layout,
     array_names,
+    check_spaces,
+    describe_factors,
     from_json_file,
     is_shard_file,
     is_shard_manifest,
@@ -31,14 +45,17 @@ from sb3_abisim.data.format import (
     to_json_bytes,
 )
 
+# Of data that was not collected here: a shard ends with the segment that reaches one of them.
+SHARD_TRANSITIONS = 8192
+SHARD_BYTES = 2**27
 _PACKAGES = ("gymnasium", "gymnasium-robotics", "mujoco", "numpy")
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Segment:
     """An episode, or the part of one that fell into a shard: L transitions between L + 1 frames.
 
-    :param frames: L + 1 arrays of uint8 [C, H, W], or one array of them; None where frames are drawn from the factors
+    :param frames: L + 1 arrays of uint8 [C, H, W], or one array of them; None where frames are rendered from factors
     :param actions: [L, ...]
     :param end: TERMINATED, TRUNCATED or CUT
     :param factors: name to L + 1 rows
@@ -47,7 +64,7 @@ class Segment:
     frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8] | None
     actions: NDArray[Any]
     end: int
-    factors: dict[str, Any] = field(default_factory=dict)
+    factors: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def package_versions() -> dict[str, str]:
@@ -74,6 +91,133 @@ def check_folder(folder: Path) -> None:
             raise ValueError(
                 f"{folder} holds something else ({shown}); name a new or empty folder, nothing was changed"
             )
+
+
+def write_dataset(
+    folder: str | os.PathLike[str],
+    segments: Iterable[Segment],
+    *,
+    env_id: str,
+    observation_space: gym.Space[Any],
+    action_space: gym.Space[Any],
+    source: Any,
+    env_kwargs: dict[str, Any] | None = None,
+    policy: str = "unknown",
+) -> str:
+    """Make a dataset folder of data that something else has recorded.
+
+    :param folder: new or empty
+    :param segments: episodes, or parts of them, at least one; an iterator's are in memory shard by shard
+    :param env_id: id of the environment that they were recorded in, or any name
+    :param observation_space: of one environment: uint8 images in 0..255, channels first
+    :param action_space: of one environment: ``Discrete``, or a bounded float32 ``Box``
+    :param source: where they come from, JSON types; not None, which stands for data that was collected here
+    :param env_kwargs: keyword arguments of the environment, JSON types
+    :param policy: what chose the actions
+    :return: the dataset's hash
+    :raises ValueError: if anything does not fit
+    """
+    check_spaces(observation_space, action_space)
+    if source is None:
+        raise ValueError("source must say where the data comes from, got None")
+    try:
+        env_kwargs, source = json.loads(json.dumps([env_kwargs or {}, source]))
+    except TypeError as error:
+        raise ValueError(
+            f"env_kwargs and source must be what JSON can hold ({error}): {env_kwargs}, {source}"
+        ) from None
+    fitting = _fitting(segments, action_space)
+    first = next(fitting, None)
+    if first is None:
+        raise ValueError(f"there are no segments to write into {folder}, from {source!r}")
+    identity = {
+        "format_version": FORMAT_VERSION,
+        "env_id": env_id,
+        "env_kwargs": env_kwargs,
+        "observation_space": space_to_json(observation_space),
+        "action_space": space_to_json(action_space),
+        "factors": describe_factors({name: np.asarray(rows) for name, rows in first.factors.items()}),
+        CONTENT_HASH_KEY: None,
+        "policy": policy,
+        "seed": None,
+        "n_envs": None,
+        "steps_per_shard": None,
+        "source": source,
+    }
+    return write_segments(Path(folder), itertools.chain([first], fitting), identity)
+
+
+def _fitting(segments: Iterable[Segment], action_space: gym.Space[Any]) -> Iterator[Segment]:
+    for number, segment in enumerate(segments):
+        actions = fit_actions(segment.actions, action_space, f"segment {number}")
+        if not len(actions) or segment.end not in (TERMINATED, TRUNCATED, CUT):
+            raise ValueError(
+                f"segment {number} has {len(actions)} actions and end {segment.end!r}; it needs one action at least, "
+                "and an end that is TERMINATED, TRUNCATED or CUT"
+            )
+        yield dataclasses.replace(segment, actions=actions)
+
+
+def fit_actions(actions: Any, action_space: gym.Space[Any], where: str) -> NDArray[Any]:
+    """Actions as a dataset holds them.
+
+    :param actions: of one segment, [L] or [L, 1] integers, or float32 [L, ...]
+    :param action_space: of one environment
+    :param where: of what they are, for messages
+    :return: int64 [L] or float32 [L, ...]
+    :raises ValueError: if they are not in the action space
+    """
+    array = np.asarray(actions)
+    if isinstance(action_space, spaces.Discrete):
+        array = array.reshape(len(array)) if array.size == len(array) else array
+        low, high = action_space.start, action_space.start + action_space.n - 1
+        fits = array.dtype.kind in "iu" and array.ndim == 1
+    else:
+        assert isinstance(action_space, spaces.Box)
+        low, high = action_space.low, action_space.high
+        fits = array.dtype == np.float32 and array.shape[1:] == action_space.shape
+    if not fits or not ((array >= low) & (array <= high)).all():
+        raise ValueError(
+            f"{where} has actions ({array.dtype}, {array.shape}) that are not in the action space {action_space}"
+        )
+    return array.astype(np.int64) if isinstance(action_space, spaces.Discrete) else array
+
+
+def write_segments(folder: Path, segments: Iterable[Segment], identity: dict[str, Any]) -> str:
+    """Write a whole dataset from segments, in shards of whole segments.
+
+    :param folder: new or empty
+    :param segments: at least one; what they raise leaves the dataset unfinished
+    :param identity: see :func:`open_writer`
+    :return: the dataset's hash
+    :raises ValueError: if the folder holds something, or anything does not fit
+    """
+    check_folder(folder)
+    with open_writer(folder, identity) as writer:
+        if writer.is_finished:
+            raise ValueError(f"{folder} already holds this dataset; name a new folder, or remove it to write it again")
+        n_shards = 0
+        for group in _grouped(segments):
+            writer.write_shard(n_shards, group)
+            n_shards += 1
+        if not n_shards:
+            raise ValueError(f"there are no segments to write into {folder}, from {identity['source']!r}")
+        return writer.finish(n_shards)
+
+
+def _grouped(segments: Iterable[Segment]) -> Iterator[list[Segment]]:
+    """Segments in groups of the size of a shard."""
+    group: list[Segment] = []
+    n_transitions = n_bytes = 0
+    for segment in segments:
+        group.append(segment)
+        n_transitions += len(segment.actions)
+        n_bytes += np.asarray(segment.frames).nbytes
+        if n_transitions >= SHARD_TRANSITIONS or n_bytes >= SHARD_BYTES:
+            yield group
+            group, n_transitions, n_bytes = [], 0, 0
+    if group:
+        yield group
 
 
 @contextlib.contextmanager
@@ -110,7 +254,8 @@ class DatasetWriter:
                     raise DatasetError(f"{path} is damaged (its keys are not those of a dataset)")
             except DatasetError as error:
                 raise DatasetError(f"{error}; remove {folder} and collect it again") from None
-            _require_same(folder, there, self._config, IDENTITY_KEYS)
+            named = {**there, "env_kwargs": current_env_kwargs(there["env_kwargs"])}
+            _require_same(folder, named, self._config, IDENTITY_KEYS)
             self._versions_here, self._config = self._config["versions"], there
         else:
             self._versions_here = self._config["versions"]
@@ -171,7 +316,7 @@ class DatasetWriter:
         """Write meta.json over shards 0 to ``n_shards - 1``.
 
         :param n_shards: how many there are, at least 1
-        :return: the dataset's digest
+        :return: the dataset's hash
         """
         shards = [from_json_file(self.folder / shard_file(k)) for k in range(n_shards)]
         meta = make_meta(self._config, shards)
@@ -201,7 +346,7 @@ def _require_same(folder: Path, there: dict[str, Any], here: dict[str, Any], key
         sides = "; ".join(f"{key}: {there.get(key)!r} in the folder, {here[key]!r} now" for key in different)
         if different == ["versions"]:
             raise DatasetError(
-                f"{folder} was begun with other package versions, which may draw other frames ({sides}); "
+                f"{folder} was begun with other package versions, which may render other frames ({sides}); "
                 "install those versions to continue, or collect into a new folder"
             )
         raise ValueError(f"{folder} was begun with other arguments ({sides}); repeat those, or name a new folder")

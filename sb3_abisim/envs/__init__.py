@@ -54,7 +54,7 @@ for _id, (_path, _kwargs, _steps, _traits) in _TABLE.items():
 
 
 def __getattr__(name: str) -> Any:
-    # Later, since it imports what it draws with.
+    # Later, since it imports the rasterizer.
     if name == "PointMazePixels":
         from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
 

@@ -36,8 +36,8 @@ class BatchEnv(gym.vector.VectorEnv):
         "render_fps": 10,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
-    # Whether :meth:`draw` is there: datasets then hold the factors alone and draw their frames when they are read.
-    draws_factors: ClassVar[bool] = False
+    # Whether :meth:`render_factors` is there: datasets then hold the factors alone, and render observations on reading.
+    renders_factors: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class BatchEnv(gym.vector.VectorEnv):
     # The dynamics, written by subclasses over index arrays.
 
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
-        """Start a new episode in each of the copies ``indices``, drawing from ``self._generators[i]`` alone."""
+        """Start a new episode in each of the copies ``indices``, sampling from ``self._generators[i]`` alone."""
         raise NotImplementedError
 
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -93,9 +93,10 @@ class BatchEnv(gym.vector.VectorEnv):
         raise NotImplementedError
 
     def _infos(self, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
-        """What ``infos`` says about the step just taken, name to array (num_envs,); without more, the end is success.
+        """What ``infos`` reports of the step just taken; by default, an episode that has ended is a success.
 
         :param ended: as returned by :meth:`_advance`
+        :return: name to array (num_envs,)
         """
         return {"is_success": ended.copy()}
 
@@ -108,18 +109,18 @@ class BatchEnv(gym.vector.VectorEnv):
             raise ValueError(f"{type(self).__name__} knows no reset options, got {sorted(options)}")
 
     def _render_frame(self, index: int) -> NDArray[np.uint8]:
-        """A picture of one copy that a person can look at, shape (height, width, 3), RGB."""
+        """An image of one copy for people, shape (height, width, 3), RGB."""
         raise NotImplementedError
 
     def factors(self) -> dict[str, NDArray[Any]]:
-        """The simulator's state behind the current observations, for probes; no loss may read it.
+        """The simulator's state that the current observations show, for probes; no loss may read it.
 
         :return: name to array of shape (num_envs, ...), copies
         """
         raise NotImplementedError
 
-    def draw(self, factors: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
-        """The frames that belong to factors, equal to the bit to the observations at that time; changes nothing.
+    def render_factors(self, factors: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+        """The observations of states, equal to the bit to those at that time; changes nothing.
 
         :param factors: name to array of shape (n, ...), as of :meth:`factors`, at any time and in any copies
         :return: (n, *observation shape)
@@ -135,7 +136,7 @@ class BatchEnv(gym.vector.VectorEnv):
         """Start a new episode in every copy.
 
         :param seed: copy i gets ``seed + i``, or ``seed[i]`` of a list; None goes on with the present generators
-        :param options: none are known, unless the environment says so
+        :param options: none are known, unless the environment documents some
         """
         self._take_options(options or {})
         seeds = list(seed) if isinstance(seed, (list, tuple)) else None
@@ -154,7 +155,7 @@ class BatchEnv(gym.vector.VectorEnv):
         return self._observe(self._everyone), {}
 
     def take_generator(self, generator: np.random.Generator) -> None:
-        """Draw from a given generator, in a batch of one.
+        """Sample from a given generator, in a batch of one.
 
         :param generator: :class:`SingleEnv`'s
         """
@@ -195,7 +196,7 @@ class BatchEnv(gym.vector.VectorEnv):
         return observations, rewards, ended, truncated, infos
 
     def _restart(self, ended: NDArray[np.int64], observations: Any, infos: dict[str, Any]) -> dict[str, Any]:
-        """Begin new episodes in ``ended``, write their first frames into ``observations``, return the final infos."""
+        """Begin new episodes in ``ended``, put their first observations in place, return the final infos."""
         mask = np.zeros(self.num_envs, dtype=bool)
         mask[ended] = True
         final_obs = np.full(self.num_envs, None, dtype=object)
@@ -234,7 +235,7 @@ class BatchEnv(gym.vector.VectorEnv):
         return array.astype(np.int64) if array.dtype.kind == "u" else array
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A picture of every copy, each (height, width, 3) uint8 RGB; None without ``render_mode``."""
+        """An image of every copy, each (height, width, 3) uint8 RGB; None without ``render_mode``."""
         if self.render_mode is None:
             return None
         return tuple(self._render_frame(i) for i in range(self.num_envs))
@@ -243,8 +244,8 @@ class BatchEnv(gym.vector.VectorEnv):
 class SingleEnv(gym.Env):
     """A ``gymnasium.Env`` made of a :class:`BatchEnv` of one copy.
 
-    ``info["is_success"]`` is a bool at every step; what else the batch says about a step stands beside it. Episodes
-    have no time limit of their own: ``gymnasium.make`` adds the registered one.
+    ``info["is_success"]`` is a bool at every step; what else the batch reports of a step stands beside it. Episodes
+    have no time limit here: ``gymnasium.make`` adds the registered one.
 
     :param render_mode: None or "rgb_array"
     :param kwargs: passed to the batch class
@@ -263,10 +264,10 @@ class SingleEnv(gym.Env):
         """Start a new episode; ``seed`` determines it and all that follow.
 
         :param seed: None goes on with the present generator
-        :param options: none are known, unless the environment says so
+        :param options: none are known, unless the environment documents some
         """
         super().reset(seed=seed)
-        # One generator: a wrapper that draws from `env.np_random` advances the same stream as the environment.
+        # One generator: a wrapper that samples from `env.np_random` advances the same stream as the environment.
         self.batch.take_generator(self.np_random)
         observations, _ = self.batch.reset(options=options)
         return one_of(observations, 0), {}
@@ -282,11 +283,11 @@ class SingleEnv(gym.Env):
         return one_of(observations, 0), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def factors(self) -> dict[str, NDArray[Any]]:
-        """The simulator's state behind the current observation, for probes; see :meth:`BatchEnv.factors`."""
+        """The simulator's state that the current observation shows, for probes; see :meth:`BatchEnv.factors`."""
         return {name: array[0] for name, array in self.batch.factors().items()}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """A picture that a person can look at, (height, width, 3) uint8 RGB; None without ``render_mode``."""
+        """An image for people, (height, width, 3) uint8 RGB; None without ``render_mode``."""
         frames = self.batch.render()
         return None if frames is None else frames[0]
 

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.grids import flood_fill
 from sb3_abisim.envs.base import BatchEnv, SingleEnv
 
 SIZE = 15
@@ -43,7 +44,7 @@ _CELL_PIXELS = 32
 
 _N_CELLS = SIZE * SIZE
 _GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
-# Bitboards: cell (x, y) is bit y * _STRIDE + x. The sixteenth column is never free, so shifts cannot wrap around.
+# Bitboards of :mod:`~sb3_abisim.common.grids`; their sixteenth column is never free.
 _STRIDE = SIZE + 1
 _BITS = np.array([1 << (y * _STRIDE + x) for y in range(SIZE) for x in range(SIZE)], dtype=object)
 _BOARD = int(_BITS.sum())
@@ -60,18 +61,6 @@ def _blocks_sparing(cell: int) -> NDArray[np.int64]:
 
 
 _BLOCKS_SPARING = [_blocks_sparing(cell) for cell in range(SIZE * SIZE)]
-
-
-def _connected(start: int, goal: int, free: int) -> bool:
-    """Whether a path of free cells joins two bits of a bitboard (flood fill, all cells of a front at once)."""
-    reached = start
-    while not reached & goal:
-        grown = reached | reached << 1 | reached >> 1 | reached << _STRIDE | reached >> _STRIDE
-        grown &= free
-        if grown == reached:
-            return False
-        reached = grown
-    return True
 
 
 def _neighbors() -> NDArray[np.int64]:
@@ -104,14 +93,14 @@ class Nav2DVectorEnv(BatchEnv):
     and 0 elsewhere, indexed ``[channel, y, x]``. **Action**: ``Discrete(4)``, the moves (dx, dy) = (0,-1), (0,1),
     (-1,0), (1,0), that is up, down, left, right; a move into an obstacle or off the grid leaves the agent in place.
     **Reward**: -1 a step, 0 for the step that reaches the goal (7, 7), which ends the episode. **Truncation** after
-    50 steps. ``info["is_success"]`` tells whether the goal was reached.
+    50 steps. ``info["is_success"]`` is true where the goal was reached.
 
     **Start**, ``layout="random"`` (``Nav2D-v0``): agent uniform over all cells but the goal; 20 obstacles of 2 x 2
     cells uniform over the positions inside the grid that cover neither agent nor goal (they may overlap); all is
-    drawn anew until a path exists. ``"corridor"`` (``Nav2DCorridor-v0``) and ``"maze"`` (``Nav2DMaze-v0``): the
-    reachable region is fixed (:data:`LAYOUTS`) and empty; 20 blocks of 2 x 2 are drawn anew each episode and shown
-    where they fall on cells that cannot be reached. The paper prints both structures as small pictures only, so
-    their cells are ours.
+    sampled again until a path exists. ``"corridor"`` (``Nav2DCorridor-v0``) and ``"maze"`` (``Nav2DMaze-v0``): the
+    reachable region is fixed (:data:`LAYOUTS`) and empty; 20 blocks of 2 x 2 are sampled in each episode and shown
+    where they fall on cells that cannot be reached. The paper prints both structures as small figures only, so we
+    chose their cells.
 
     :param num_envs: number of copies
     :param max_episode_steps: set by ``gymnasium.make_vec``
@@ -139,11 +128,11 @@ class Nav2DVectorEnv(BatchEnv):
             autoreset,
         )
         self.layout = layout
-        # Pictures are kept up to date move by move; channel order as in CHANNELS, cells flattened.
-        self._pictures = np.zeros((num_envs, len(CHANNELS), SIZE * SIZE), dtype=np.uint8)
-        self._pictures[:, 2, _GOAL_CELL] = 255
-        # Agents are kept as indices into the flattened pictures, and so is where each move leads from each index, so
-        # that a step is one lookup.
+        # Observations are kept up to date move by move; channel order as in CHANNELS, cells flattened.
+        self._observations = np.zeros((num_envs, len(CHANNELS), SIZE * SIZE), dtype=np.uint8)
+        self._observations[:, 2, _GOAL_CELL] = 255
+        # Agents are kept as indices into the flattened observations, and so is where each move leads from each index.
+        # A step is then one lookup.
         self._first = np.arange(num_envs) * len(CHANNELS) * _N_CELLS
         self._agents = self._first.copy()
         self._goals = self._first + _GOAL_CELL
@@ -155,16 +144,16 @@ class Nav2DVectorEnv(BatchEnv):
             self._starts = np.flatnonzero((cells == ".") & (np.arange(SIZE * SIZE) != _GOAL_CELL))
 
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
-        draw = self._draw_random if self.layout == "random" else self._draw_fixed
+        sample = self._sample_random if self.layout == "random" else self._sample_fixed
         for i in indices:
-            cell, obstacles = draw(self._generators[i])
+            cell, obstacles = sample(self._generators[i])
             self._agents[i] = self._first[i] + cell
-            self._pictures[i, 0] = 0
-            self._pictures[i, 0, cell] = 255
-            self._pictures[i, 1] = np.where(obstacles, 255, 0)
+            self._observations[i, 0] = 0
+            self._observations[i, 0, cell] = 255
+            self._observations[i, 1] = np.where(obstacles, 255, 0)
             self._targets[i, :_N_CELLS] = self._first[i] + next_cells(obstacles)
 
-    def _draw_random(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
+    def _sample_random(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
         """An agent's cell and obstacles (SIZE * SIZE,) with a path to the goal."""
         while True:
             cell = int(generator.integers(SIZE * SIZE - 1))
@@ -174,20 +163,21 @@ class Nav2DVectorEnv(BatchEnv):
             board = 0
             for block in blocks:
                 board |= _BLOCK_BITS[block]
-            if _connected(_BITS[cell], _BITS[_GOAL_CELL], _BOARD & ~board):
+            start = _BITS[cell]
+            if flood_fill(_BITS[_GOAL_CELL], _BOARD & ~board, _STRIDE, stop=start) & start:
                 obstacles = np.zeros(SIZE * SIZE, dtype=bool)
                 obstacles[_BLOCK_CELLS[blocks]] = True
                 return cell, obstacles
 
-    def _draw_fixed(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
-        """An agent's cell in the fixed reachable region, and its walls with new scenery behind them."""
+    def _sample_fixed(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
+        """An agent's cell in the fixed reachable region, and its walls with new scenery beyond them."""
         cell = int(self._starts[generator.integers(len(self._starts))])
         scenery = np.zeros(SIZE * SIZE, dtype=bool)
         scenery[_BLOCK_CELLS[generator.integers(len(_BLOCK_CELLS), size=N_OBSTACLES)]] = True
         return cell, self._walls | (scenery & self._scenery)
 
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        pixels = self._pictures.reshape(-1)
+        pixels = self._observations.reshape(-1)
         pixels[self._agents] = 0
         self._agents = self._targets.reshape(-1)[self._agents * len(MOVES) + actions]
         pixels[self._agents] = 255
@@ -196,16 +186,16 @@ class Nav2DVectorEnv(BatchEnv):
 
     def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
         # Indexing with an array copies, so callers may keep what they get.
-        return self._pictures[indices].reshape(-1, len(CHANNELS), SIZE, SIZE)
+        return self._observations[indices].reshape(-1, len(CHANNELS), SIZE, SIZE)
 
     def factors(self) -> dict[str, NDArray[Any]]:
         """Agent (x, y), int64 (num_envs, 2); obstacles by [y, x], bool (num_envs, 15, 15)."""
         y, x = np.divmod(self._agents - self._first, SIZE)
-        obstacles = self._pictures[:, 1].reshape(-1, SIZE, SIZE) > 0
+        obstacles = self._observations[:, 1].reshape(-1, SIZE, SIZE) > 0
         return {"agent": np.stack([x, y], axis=1), "obstacles": obstacles}
 
     def _render_frame(self, index: int) -> NDArray[np.uint8]:
-        agent, obstacles, goal = self._pictures[index].reshape(-1, SIZE, SIZE) > 0
+        agent, obstacles, goal = self._observations[index].reshape(-1, SIZE, SIZE) > 0
         cells = np.empty((SIZE, SIZE, 3), dtype=np.uint8)
         cells[:] = _COLORS["floor"]
         cells[obstacles] = _COLORS["obstacles"]

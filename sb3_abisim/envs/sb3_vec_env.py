@@ -1,4 +1,4 @@
-"""The environments of this package as a Stable-Baselines3 ``VecEnv`` that moves all copies by one call.
+"""The environments of this package as a batched VecEnv of Stable-Baselines3: one call moves all copies.
 
 ``DummyVecEnv`` steps its environments one after the other, each a batch of one. Here the copies are rows of a single
 batch, stepped at once; ``Monitor`` and all other wrappers stay around each copy as they were.

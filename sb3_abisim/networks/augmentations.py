@@ -1,7 +1,7 @@
-"""Random changes of pictures, one draw per picture, for contrastive pretraining.
+"""Random augmentations of observations, sampled for each of a batch, for contrastive pretraining.
 
-All take float (batch, channels, height, width) in 0..1 and a strength, and return new pictures of the same shape.
-Random numbers are drawn on the CPU, so that they do not depend on the device.
+All take float (batch, channels, height, width) in 0..1 and a strength, and return new tensors of the same shape.
+Random numbers are sampled on the CPU, so that they do not depend on the device.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from torch import nn
 def random_noise(images: th.Tensor, strength: float) -> th.Tensor:
     """Add Gaussian noise to every intensity; the result may leave 0..1.
 
-    :param images: the pictures
+    :param images: the observations
     :param strength: standard deviation, at least 0
     """
     return images + strength * th.randn(images.shape).to(images)
@@ -22,7 +22,7 @@ def random_noise(images: th.Tensor, strength: float) -> th.Tensor:
 def random_shift(images: th.Tensor, strength: float) -> th.Tensor:
     """Shift by whole pixels, repeating the border (Yarats et al. 2021).
 
-    :param images: the pictures
+    :param images: the observations
     :param strength: largest shift along each axis, as a share of the side; above 0, it is a pixel at least
     """
     n, _, height, width = images.shape
@@ -38,14 +38,15 @@ def random_shift(images: th.Tensor, strength: float) -> th.Tensor:
 
 
 def random_crop(images: th.Tensor, strength: float) -> th.Tensor:
-    """Cut a window out at a random place and enlarge it to the full size (Laskin et al. 2020 leave it small, but an
-    encoder here takes one size).
+    """Cut a window out at a random place and enlarge it to the full size.
 
-    :param images: the pictures
+    Laskin et al. (2020) leave it small, but an encoder here takes one size.
+
+    :param images: the observations
     :param strength: share of each side that is cut away, in 0..1
     """
     n = len(images)
-    # Centers in the coordinates of grid_sample, where the picture spans -1..1.
+    # Centers in the coordinates of grid_sample, where the image spans -1..1.
     centers = strength * (2.0 * th.rand(n, 2) - 1.0)
     theta = th.zeros(n, 2, 3)
     theta[:, 0, 0] = theta[:, 1, 1] = 1.0 - strength

@@ -7,7 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
 from sb3_abisim.registry import get_network, networks
@@ -43,19 +46,16 @@ class Encoder(nn.Module):
         self.scale: th.Tensor
         self.register_buffer("offset", th.zeros(features_dim))
         self.register_buffer("scale", th.ones(()))
-        self._lay_out(th.channels_last)
-
-    def _lay_out(self, memory_format: th.memory_format) -> None:
-        self.to(memory_format=memory_format)  # type: ignore[call-overload]
+        set_memory_format(self, th.channels_last)
 
     def apply(self, fn: Callable[[nn.Module], None]) -> "Encoder":
         """As in torch, whose ``orthogonal_`` (which SB3 initializes with) takes no weights with channels last.
 
         :param fn: called on every submodule
         """
-        self._lay_out(th.contiguous_format)
+        set_memory_format(self, th.contiguous_format)
         super().apply(fn)
-        self._lay_out(th.channels_last)
+        set_memory_format(self, th.channels_last)
         return self
 
     def spec(self) -> dict[str, Any]:
@@ -91,6 +91,29 @@ class Encoder(nn.Module):
         self.scale /= variance.sqrt()
 
 
+def set_memory_format(module: nn.Module, memory_format: th.memory_format) -> None:
+    """Change the order in memory of the weights of 2-d convolutions, in place.
+
+    :param module: any; unlike ``Module.to``, this leaves weights of other dimensions alone instead of refusing them
+    :param memory_format: ``torch.channels_last`` or ``torch.contiguous_format``
+    """
+    for tensor in (*module.parameters(), *module.buffers()):
+        if tensor.dim() == 4:
+            tensor.data = tensor.data.contiguous(memory_format=memory_format)
+
+
+def preprocess(observations: th.Tensor | NDArray[np.uint8], observation_space: gym.Space[Any]) -> th.Tensor:
+    """Observations as encoders take them, by the preprocessing that SB3 puts before a features extractor.
+
+    :param observations: uint8 (batch, channels, height, width)
+    :param observation_space: of one observation
+    :return: float32 in 0..1, of the same shape, device and memory format
+    """
+    inputs = preprocess_obs(th.as_tensor(observations), observation_space)
+    assert isinstance(inputs, th.Tensor)
+    return inputs
+
+
 def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **kwargs: Any) -> Encoder:
     """Build an encoder for an observation space.
 
@@ -100,6 +123,8 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     :raises ValueError: for an unknown name or keyword, or a space that the network does not fit
     """
     shape = observation_space.shape
+    if shape is None or len(shape) != 3:
+        raise ValueError(f"observations must be images (channels, height, width), got {observation_space}")
     if name is None:
         defaults = {key: network.observation_shape for key, network in networks().items() if network.observation_shape}
         fitting = [key for key, observation_shape in defaults.items() if observation_shape == shape]
@@ -107,7 +132,7 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
             known = ", ".join(f"{key} {observation_shape}" for key, observation_shape in defaults.items())
             raise ValueError(
                 f"no default network for observations of shape {shape}; known are: {known}. Name a network, or "
-                "register one of your own with sb3_abisim.register_network"
+                "register a custom one with sb3_abisim.register_network"
             )
         name = fitting[0]
     network = get_network(name)
@@ -116,7 +141,6 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     except TypeError as error:
         raise ValueError(f"{name} does not take these arguments: {error}") from error
     if not isinstance(module, Encoder):
-        assert shape is not None
         module = Encoder(module, _features_dim(name, module, shape), name, kwargs, shape)
     # SB3 turns observations into float32, whatever torch's default is.
     encoder: Encoder = module.float()
@@ -132,7 +156,7 @@ def _features_dim(name: str, module: nn.Module, shape: tuple[int, ...]) -> int:
     try:
         with th.no_grad(), th.random.fork_rng(devices=[]):
             output = module.eval()(th.zeros((1, *shape), device=tensor.device, dtype=tensor.dtype))
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, TypeError, IndexError) as error:
         raise ValueError(f"the network {name} does not take observations of shape {shape}: {error}") from error
     finally:
         module.train(mode)

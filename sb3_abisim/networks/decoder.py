@@ -1,4 +1,4 @@
-"""The network that turns embeddings back into pictures."""
+"""The network that reconstructs observations from embeddings."""
 
 import math
 
@@ -12,13 +12,13 @@ SMALLEST = 8
 
 
 class Decoder(nn.Module):
-    """Embeddings to pictures of any size: a linear layer to a small map, then 3x3 convolutions and
-    nearest-neighbor upsampling, doubling the side until it is that of the picture.
+    """Embeddings to images of any size: a linear layer to a small map, then 3x3 convolutions and nearest-neighbor
+    upsampling, doubling the side until it is that of the observation.
 
     The paper gives no decoder. Upsampling, unlike transposed convolutions, reaches odd sides such as 15 exactly.
 
     :param features_dim: size of the embedding
-    :param shape: (channels, height, width) of the picture
+    :param shape: (channels, height, width) of the observation
     """
 
     def __init__(self, features_dim: int, shape: tuple[int, ...]) -> None:
@@ -34,7 +34,7 @@ class Decoder(nn.Module):
         self.layers = nn.Sequential(*layers, nn.Conv2d(widths[-1], n_channels, 3, padding=1))
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        """Pictures, as logits of intensities in 0..1.
+        """Reconstruct, as logits of intensities in 0..1.
 
         :param features: float (batch, features_dim)
         :return: float (batch, channels, height, width)

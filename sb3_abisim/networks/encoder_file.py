@@ -1,12 +1,13 @@
 """The encoder file: pretrained weights and everything needed to refuse a wrong use of them.
 
-One safetensors file. Its tensors are the weights (``encoder.*``), the golden batch (``golden.observations``, uint8
-frames, and ``golden.embeddings``, what the network made of them when it was saved) and ``digest``. Its metadata hold
-one JSON text: format, network and contract. (One text, because safetensors writes several in random order.) The digest
-is the sha256 of the file with the digest's own 32 bytes set to zero, so any changed bit is noticed at load. It protects
-against damage, not against forgery; a forged file still runs no code, since the network is looked up in our own table.
+One safetensors file. Its tensors are the weights (``encoder.*``), the reference batch (a few uint8 observations, and
+what the network made of them when it was saved) and the hash. The metadata of safetensors hold one JSON text: format,
+network and metadata. (One text, because safetensors writes several in random order.) The hash is the sha256 of the file
+with the hash's 32 bytes set to zero, so any changed bit is noticed at load. It protects against damage, not against
+forgery. A forged file still runs no code: its network is looked up by name among those that are registered.
 """
 
+import contextlib
 import copy
 import hashlib
 import json
@@ -24,24 +25,31 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from stable_baselines3.common.preprocessing import is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_abisim._version import __version__
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.spaces import space_to_json
 from sb3_abisim.common.vocabulary import current_env_kwargs, current_settings
-from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.networks.base import Encoder, make_encoder, preprocess
+from sb3_abisim.registry import networks
 
 FORMAT = 1
-# The embeddings of the golden batch may differ by this fraction of the largest one (other machine, other torch).
+# The embeddings of the reference batch may differ by this fraction of the largest one (other machine, other torch).
 REFERENCE_TOLERANCE = 1e-4
 MAX_FILE_BYTES = 1 << 30
 HUB_PREFIX = "hf://"
 # A zoo run on a frozen encoder keeps a copy of its file under this name, in its folder <env id> beside config.yml.
 RUN_COPY = "encoder.safetensors"
 
+# Names in the file: of the JSON text, its metadata, the dataset's hash in there, and the tensors.
 _DOCUMENT_KEY = "sb3_abisim"
+_METADATA_KEY = "contract"
+_DATASET_HASH_KEY = "dataset_digest"
+_HASH_KEY = "digest"
+_REFERENCE_KEYS = ("golden.observations", "golden.embeddings")
+_WEIGHT_PREFIX = "encoder."
 _METADATA_KEYS = {
     "observation_space",
     "action_space",
@@ -49,11 +57,10 @@ _METADATA_KEYS = {
     "env_kwargs",
     "objective",
     "settings",
-    "dataset_digest",
+    _DATASET_HASH_KEY,
     "versions",
 }
 _HASH_BYTES = 32
-_WEIGHT_PREFIX = "encoder."
 _REMEDY = "copy it again from where it came from, or write it again with sb3-abisim pretrain"
 
 
@@ -70,9 +77,9 @@ class EncoderFile:
     """A verified encoder file.
 
     :param path: where it was read
-    :param digest: sha256 in hexadecimal of its content
+    :param hash: sha256 in hexadecimal of its content
     :param encoder: the network with its weights, on the CPU, in evaluation mode
-    :param contract: observation_space, action_space, env_id, env_kwargs, objective, settings, dataset_digest, versions
+    :param metadata: observation_space, action_space, env_id, env_kwargs, objective, settings, dataset_hash, versions
     """
 
     path: Path
@@ -121,10 +128,10 @@ def save_encoder(
     :param env_kwargs: its keyword arguments, JSON types
     :param objective: short name of the objective, e.g. "ssi"
     :param settings: hyperparameters of the pretraining, JSON types
-    :param dataset_digest: digest of the dataset
-    :param golden_observations: a few frames, uint8 (n, channels, height, width)
-    :return: digest of the content, sha256 in hexadecimal
-    :raises ValueError: for weights that are not finite, values that JSON cannot hold, frames that do not fit
+    :param dataset_hash: hash of the dataset
+    :param reference_observations: a few observations, uint8 (n, channels, height, width)
+    :return: hash of the content, sha256 in hexadecimal
+    :raises ValueError: for weights that are not finite, values that JSON cannot hold, observations that do not fit
     """
     shape = observation_space.shape
     if not is_image_space(observation_space) or shape is None:
@@ -132,19 +139,19 @@ def save_encoder(
     reference = th.from_numpy(np.array(reference_observations, order="C"))
     if reference.dtype != th.uint8 or tuple(reference.shape[1:]) != shape or len(reference) == 0:
         raise ValueError(
-            f"golden_observations must be uint8 (n, *{shape}), got {reference.dtype} {tuple(reference.shape)}"
+            f"reference_observations must be uint8 (n, *{shape}), got {reference.dtype} {tuple(reference.shape)}"
         )
     document = {
         "format": FORMAT,
         "network": encoder.spec(),
-        "contract": {
+        _METADATA_KEY: {
             "observation_space": _describe(observation_space),
             "action_space": space_to_json(action_space),
             "env_id": env_id,
             "env_kwargs": env_kwargs,
             "objective": objective,
             "settings": settings,
-            "dataset_digest": dataset_hash,
+            _DATASET_HASH_KEY: dataset_hash,
             "versions": _versions(),
         },
     }
@@ -157,8 +164,7 @@ def save_encoder(
     broken = [name for name, value in tensors.items() if not bool(th.isfinite(value).all())]
     if broken:
         raise ValueError(f"weights are not finite, the encoder is not saved: {broken}")
-    tensors["golden.observations"] = reference
-    tensors["golden.embeddings"] = embed(on_cpu, observation_space, reference)
+    tensors |= zip(_REFERENCE_KEYS, (reference, embed(on_cpu, observation_space, reference)), strict=True)
     data, hash = _serialize(tensors, text)
     write_atomic(path, lambda file: file.write(data))
     return hash
@@ -168,9 +174,10 @@ def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
     """Read and verify an encoder file.
 
     :param name: as for :func:`resolve_encoder`
-    :return: the encoder with its contract
+    :return: the encoder with its metadata, under today's names
     :raises EncoderNotFoundError: when there is no such file
-    :raises EncoderFileError: when a bit has changed, the file is something else, or its golden batch does not agree
+    :raises EncoderFileError: when a bit has changed, the file is something else, its network is not registered, or its
+        reference batch does not agree
     """
     path = resolve_encoder(name)
     if path.stat().st_size > MAX_FILE_BYTES:
@@ -188,38 +195,38 @@ def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
                 f"{path} has format {found!r}, this version reads {FORMAT}; install a newer sb3_abisim"
             )
         tensors = safetensors.torch.load(data)
-        metadata = document["contract"]
+        metadata = document[_METADATA_KEY]
         if set(metadata) != _METADATA_KEYS:
-            raise ValueError(f"contract has the keys {sorted(metadata)}, expected {sorted(_METADATA_KEYS)}")
-        reference, expected = tensors.pop("golden.observations"), tensors.pop("golden.embeddings")
+            raise ValueError(f"the metadata have the keys {sorted(metadata)}, expected {sorted(_METADATA_KEYS)}")
+        reference, expected = (tensors.pop(key) for key in _REFERENCE_KEYS)
         if reference.dtype != th.uint8 or list(reference.shape[1:]) != metadata["observation_space"]["shape"]:
-            raise ValueError(f"golden batch {tuple(reference.shape)} is not of {metadata['observation_space']}")
+            raise ValueError(f"reference batch {tuple(reference.shape)} is not of {metadata['observation_space']}")
         space = spaces.Box(0, 255, tuple(reference.shape[1:]), np.uint8)
-        encoder = _build(space, document["network"], tensors)
+        network = document["network"]
+        _require_registered(path, network["name"])
+        encoder = _build(space, network, tensors)
     except EncoderFileError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:
         raise EncoderFileError(f"{path} is not a valid encoder file ({error!r}); {_REMEDY}") from error
     _check_reference(path, embed(encoder, space, reference), expected)
-    metadata = {**metadata, "dataset_hash": metadata.pop("dataset_digest")}
+    metadata["dataset_hash"] = metadata.pop(_DATASET_HASH_KEY)
     metadata["settings"] = current_settings(metadata["settings"])
     metadata["env_kwargs"] = current_env_kwargs(metadata["env_kwargs"])
     return EncoderFile(path, hash, encoder, metadata)
 
 
-def embed(encoder: Encoder, space: gym.Space[Any], frames: th.Tensor) -> th.Tensor:
-    """Embed uint8 frames through the preprocessing that SB3 puts before a features extractor, without gradients.
+@th.no_grad()
+def embed(encoder: Encoder, space: gym.Space[Any], observations: th.Tensor) -> th.Tensor:
+    """Embed uint8 observations through the preprocessing that SB3 puts before a features extractor, without gradients.
 
-    :param encoder: the network, on the device of the frames
-    :param space: the space of one frame
-    :param frames: uint8 (batch, channels, height, width)
+    :param encoder: the network, on the device of the observations
+    :param space: the space of one observation
+    :param observations: uint8 (batch, channels, height, width)
     :return: float32 (batch, features_dim)
     """
-    observations = preprocess_obs(frames, space)
-    assert isinstance(observations, th.Tensor)
-    with th.no_grad():
-        embeddings: th.Tensor = encoder(observations)
-        return embeddings.float().contiguous()
+    embeddings: th.Tensor = encoder(preprocess(observations, space))
+    return embeddings.float().contiguous()
 
 
 def resolve_encoder(name: str | os.PathLike[str]) -> Path:
@@ -258,9 +265,9 @@ def _versions() -> dict[str, str]:
 
 
 def _serialize(tensors: dict[str, th.Tensor], text: str) -> tuple[bytes, str]:
-    blank = safetensors.torch.save({**tensors, "digest": th.zeros(_HASH_BYTES, dtype=th.uint8)}, {_DOCUMENT_KEY: text})
+    blank = safetensors.torch.save({**tensors, _HASH_KEY: th.zeros(_HASH_BYTES, dtype=th.uint8)}, {_DOCUMENT_KEY: text})
     header_size = int.from_bytes(blank[:8], "little")
-    start = 8 + header_size + json.loads(blank[8 : 8 + header_size])["digest"]["data_offsets"][0]
+    start = 8 + header_size + json.loads(blank[8 : 8 + header_size])[_HASH_KEY]["data_offsets"][0]
     sha256 = hashlib.sha256(blank)
     return blank[:start] + sha256.digest() + blank[start + _HASH_BYTES :], sha256.hexdigest()
 
@@ -286,14 +293,14 @@ def _header(path: Path, data: bytes) -> dict[str, Any]:
 
 def _verify_hash(path: Path, data: bytes, header: dict[str, Any]) -> str:
     try:
-        entry = header["digest"]
+        entry = header[_HASH_KEY]
         start, stop = entry["data_offsets"]
         start, stop = (8 + int.from_bytes(data[:8], "little") + int(offset) for offset in (start, stop))
         stored = data[start:stop]
         if entry["dtype"] != "U8" or len(stored) != _HASH_BYTES:
-            raise ValueError("digest field has another size")
+            raise ValueError("the hash has another size")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise EncoderFileError(f"{path} has no valid digest: not an encoder file, or damaged; {_REMEDY}") from error
+        raise EncoderFileError(f"{path} has no valid hash: not an encoder file, or damaged; {_REMEDY}") from error
     actual = hashlib.sha256(data[:start] + bytes(_HASH_BYTES) + data[stop:])
     if actual.digest() != stored:
         raise EncoderFileError(
@@ -303,34 +310,52 @@ def _verify_hash(path: Path, data: bytes, header: dict[str, Any]) -> str:
     return actual.hexdigest()
 
 
+def _require_registered(path: Path, name: Any) -> None:
+    if isinstance(name, str) and name not in networks():
+        raise EncoderFileError(
+            f"{path} names the network {name!r}, which is not registered; known are {', '.join(networks())}. If you "
+            "trust the package that registers it, name it with --packages on the command line, or import it"
+        )
+
+
 def _build(space: spaces.Box, network: dict[str, Any], tensors: dict[str, th.Tensor]) -> Encoder:
     name, kwargs = network["name"], network["kwargs"]
     if not isinstance(name, str) or not isinstance(kwargs, dict):
         raise ValueError(f"network must be a name with keyword arguments, got {network}")
     weights = {key.removeprefix(_WEIGHT_PREFIX): tensors[key] for key in tensors if key.startswith(_WEIGHT_PREFIX)}
-    # First without memory: constructor arguments from a damaged or hostile file could ask for terabytes.
-    with th.device("meta"):
-        blueprint = make_encoder(space, name, **kwargs)
-    promised = {key: (tuple(value.shape), value.dtype) for key, value in blueprint.state_dict().items()}
-    stored = {key: (tuple(value.shape), value.dtype) for key, value in weights.items()}
-    if promised != stored:
-        raise ValueError(f"weights {stored} do not fit the network {name} with {kwargs}, which has {promised}")
-    # The weights drawn here are overwritten at once; the caller's random numbers must not depend on that.
+    # The weights sampled here are overwritten at once; the caller's random numbers must not depend on that.
     with th.random.fork_rng(devices=[]):
+        blueprint = None
+        # First without memory: arguments from a damaged or hostile file could ask for terabytes. Some networks cannot
+        # be built like that.
+        with contextlib.suppress(RuntimeError, ValueError), th.device("meta"):
+            blueprint = make_encoder(space, name, **kwargs)
+        if blueprint is not None:
+            _require_fit(blueprint, weights)
         encoder = make_encoder(space, name, **kwargs)
+    _require_fit(encoder, weights)
     encoder.load_state_dict(weights)
     return encoder.eval()
 
 
+def _require_fit(encoder: Encoder, weights: dict[str, th.Tensor]) -> None:
+    promised, stored = (
+        {key: (tuple(value.shape), value.dtype) for key, value in tensors.items()}
+        for tensors in (encoder.state_dict(), weights)
+    )
+    if promised != stored:
+        raise ValueError(f"weights {stored} do not fit the network {encoder.spec()}, which has {promised}")
+
+
 def _check_reference(path: Path, actual: th.Tensor, expected: th.Tensor) -> None:
     if actual.shape != expected.shape or expected.dtype != th.float32:
-        raise EncoderFileError(f"{path}: golden embeddings have shape {tuple(expected.shape)}; {_REMEDY}")
+        raise EncoderFileError(f"{path}: the reference embeddings have shape {tuple(expected.shape)}; {_REMEDY}")
     error, scale = float((actual - expected).abs().max()), float(expected.abs().max())
     # Written so that NaN fails as well.
     if not error <= REFERENCE_TOLERANCE * scale + 1e-6:
         raise EncoderFileError(
-            f"{path}: the network embeds the golden batch differently than when it was saved (largest difference "
-            f"{error:.3g}, embeddings up to {scale:.3g}); install the versions named in its contract, or pretrain again"
+            f"{path}: the network embeds the reference batch differently than when it was saved (largest difference "
+            f"{error:.3g}, embeddings up to {scale:.3g}); install the versions named in its metadata, or pretrain again"
         )
 
 

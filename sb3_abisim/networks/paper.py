@@ -1,4 +1,4 @@
-"""The networks of the paper, one class for each of its domains.
+"""The networks of the paper, one class for each of its environments.
 
 The paper trains on images in -1..+1, so that affine map is their first layer.
 """
@@ -47,8 +47,8 @@ class PaperEncoder(Encoder):
 class Nav2DEncoder(PaperEncoder):
     """15 x 15 grids to 576 = 64 x 3 x 3 numbers, the size that the paper's inverse model (2 x 576 inputs) implies.
 
-    The paper gives no layers for Nav2D. Ours: 3x3 convolutions with 32, 64, 64 channels and no padding, the first with
-    stride 2 (15 -> 7 -> 5 -> 3), no nonlinearity after the last.
+    The paper gives no layers for Nav2D. Here they are 3x3 convolutions with 32, 64, 64 channels and no padding, the
+    first with stride 2 (15 -> 7 -> 5 -> 3), and no nonlinearity after the last.
 
     :param n_input_channels: channels of the observation
     :param features_dim: size of the embedding, 9 for each channel of the last convolution
@@ -72,10 +72,10 @@ class Nav2DEncoder(PaperEncoder):
 
 
 class PointMazeEncoder(PaperEncoder):
-    """64 x 64 pictures to 32 numbers: the paper's table for Pointmass.
+    """64 x 64 images to 32 numbers: the paper's table for Pointmass.
 
     3x3 convolutions with stride 2 to 8 x 32 x 32 and 16 x 16 x 16, then an 8x8 convolution to 32 x 1 x 1. An 8x8
-    kernel does not reduce a 16 x 16 map to 1 x 1; we put a 2x2 max pooling before it, which does.
+    kernel does not reduce a 16 x 16 map to 1 x 1. A 2x2 max pooling before it, which the paper does not have, does.
 
     :param n_input_channels: channels of the observation
     :param features_dim: size of the embedding, 32 in the paper
@@ -98,7 +98,7 @@ class PointMazeEncoder(PaperEncoder):
 
 
 class ScanNavEncoder(PaperEncoder):
-    """128 x 128 RGB-D pictures to 2048 numbers: a small network for CPUs, ours.
+    """128 x 128 RGB-D images to 2048 numbers: a small network for CPUs, which the paper does not have.
 
     :param n_input_channels: channels of the observation
     """
@@ -110,7 +110,7 @@ class ScanNavEncoder(PaperEncoder):
 
 
 class ScanNavResNet18(PaperEncoder):
-    """RGB-D pictures to 2048 numbers: the visual encoder of Habitat's PointNav policy, which the paper uses.
+    """RGB-D images to 2048 numbers: the visual encoder of Habitat's PointNav policy, which the paper uses.
 
     :param n_input_channels: channels of the observation
     :param image_size: its height and width, 64, 128 or 256

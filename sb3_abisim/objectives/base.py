@@ -1,4 +1,4 @@
-"""The contract between an objective and the training loop."""
+"""What an objective is to the training loop: a loss and everything that it trains."""
 
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ TensorBatch = TransitionBatch[th.Tensor]
 class Objective(nn.Module):
     """A loss and everything it trains: the encoder and its heads.
 
-    No optimizer, logging or file is known here. Whatever must survive an interruption is a parameter or a buffer.
+    It knows of no optimizer, log or file. Whatever must survive an interruption is a parameter or a buffer.
 
     :param encoder: the network to pretrain
     :param action_space: ``Discrete`` (starting at 0) or one-dimensional ``Box``
@@ -24,7 +24,7 @@ class Objective(nn.Module):
     """
 
     name: ClassVar[str]
-    # Whether batches must hold all k actions between the two observations; the constructor then takes k.
+    # Whether batches must hold all k actions between the two observations. The constructor then takes k.
     reads_action_sequences: ClassVar[bool] = False
 
     def __init__(self, encoder: Encoder, action_space: gym.Space[Any]) -> None:

@@ -1,5 +1,6 @@
-"""Beta variational autoencoder (Higgins et al. 2017), the paper's baseline bVAE: reconstruct the picture through a
-noisy embedding.
+"""Beta variational autoencoder (Higgins et al. 2017), the paper's baseline bVAE.
+
+It reconstructs the observation through a noisy embedding.
 
 ====================  =======================================  ==========================================
 Higgins et al.        here                                     meaning
@@ -9,9 +10,9 @@ p_theta(x | z)        ``decoder``                              one Bernoulli var
 beta                  ``kl_weight``                            weight of the divergence from N(0, 1)
 ====================  =======================================  ==========================================
 
-Choices, since the paper gives none: the encoder's output is the mean of q, so that the embedding that RL gets is the
-mean; the log standard deviation is a linear function of it. Intensities in 0..1 take the Bernoulli likelihood (as in
-Higgins et al.), summed over the picture; the loss is its mean over the batch.
+Choices, since the paper gives none: the encoder's output is the mean of q, so that RL gets the mean. The log standard
+deviation is a linear function of it. Intensities in 0..1 take the Bernoulli likelihood (as in Higgins et al.), summed
+over the observation. The loss is its mean over the batch.
 """
 
 import math
@@ -35,7 +36,7 @@ def beta_vae_loss(
     """``-log p(x | z) + beta KL(q(z | x) || N(0, 1))``, mean over the batch.
 
     :param logits: of the reconstruction, (batch, channels, height, width)
-    :param observations: the pictures in 0..1, as ``logits``
+    :param observations: in 0..1, of the same shape
     :param mean: of q(z | x), (batch, features_dim)
     :param log_std: of q(z | x), (batch, features_dim)
     :param kl_weight: beta, at least 0
@@ -47,7 +48,7 @@ def beta_vae_loss(
 
 
 class BetaVAE(Objective):
-    """Embed what the picture is made of.
+    """Embed what an observation can be reconstructed from.
 
     :param encoder: the network to pretrain
     :param action_space: not used by the loss

@@ -1,4 +1,4 @@
-"""CURL (Laskin et al. 2020), a baseline of the paper: tell two changed copies of a picture from copies of others.
+"""CURL (Laskin et al. 2020), a baseline of the paper: match two augmented copies of an observation among others.
 
 ====================  =======================================  ==========================================
 Laskin et al.         here                                     meaning
@@ -9,8 +9,8 @@ W                     ``weight``                               bilinear similari
 m                     ``1 - tau``                              momentum of the average
 ====================  =======================================  ==========================================
 
-The paper changes pictures by random noise, because shifting or cropping would teach the encoder to ignore where the
-agent is; shifts and crops are options. The negatives are the other pictures of the batch.
+The paper augments by random noise, because shifts or crops would teach the encoder to ignore where the agent is. Shifts
+and crops are options. The negatives are the other observations of the batch.
 """
 
 import copy
@@ -31,7 +31,7 @@ def curl_loss(query: th.Tensor, key: th.Tensor, weight: th.Tensor) -> tuple[th.T
     """InfoNCE with bilinear similarity: ``-log (exp(q_i W k_i) / sum_j exp(q_i W k_j))``, mean over the batch.
 
     :param query: (batch, features_dim)
-    :param key: (batch, features_dim), row i of the same picture as row i of ``query``
+    :param key: (batch, features_dim), row i of the same observation as row i of ``query``
     :param weight: W, (features_dim, features_dim)
     """
     logits = query @ weight @ key.T
@@ -41,7 +41,7 @@ def curl_loss(query: th.Tensor, key: th.Tensor, weight: th.Tensor) -> tuple[th.T
 
 
 class CURL(Objective):
-    """Embed what tells one picture from the others in spite of noise.
+    """Embed what distinguishes one observation from the others in spite of noise.
 
     :param encoder: the network to pretrain
     :param action_space: not used by the loss
@@ -69,8 +69,8 @@ class CURL(Objective):
             raise ValueError(f"tau must lie in (0, 1], got {tau}")
         self.augmentation, self.strength, self.tau = augmentation, strength, tau
         self.key_encoder = copy.deepcopy(encoder).requires_grad_(False)
-        # The released code draws uniform numbers in 0..1, with which all similarities start alike; the identity makes
-        # them dot products.
+        # CURL's authors start it with uniform numbers in 0..1, with which all similarities start alike. The identity
+        # makes them dot products.
         self.weight = nn.Parameter(th.eye(encoder.features_dim))
 
     def chance_accuracy(self, batch_size: int) -> float:
@@ -81,7 +81,7 @@ class CURL(Objective):
         return 1.0 / batch_size
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
-        """InfoNCE between two changed copies; terms ``info_nce`` and ``accuracy`` (share of keys found).
+        """InfoNCE between two augmented copies; terms ``info_nce`` and ``accuracy`` (share of keys found).
 
         :param batch: transitions, of which the observations alone are read
         """

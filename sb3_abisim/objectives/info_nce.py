@@ -9,11 +9,11 @@ d                     minus the L2 distance                    similarity
 a+, a-                ``actions``, all other ``candidates``    action taken, actions not taken
 ====================  =======================================  ==========================================
 
-Choices: the paper's equation is the likelihood itself and says "d is the l2 distance"; minimized as written it would
-push each transition away from its action, so the loss here is the negative logarithm, and d minus the distance.
+Choices: the paper's equation is the likelihood itself and says "d is the l2 distance". Minimized as written, it would
+push each transition away from its action. So the loss here is the negative logarithm, and d minus the distance.
 
 The pair is written [psi(s), psi(s') - psi(s)], not [psi(s), psi(s')]: an embedded action can be near to the change
-that it makes, but not near to all states that it was taken in. In a trial with the plain pair Nav2D stayed at chance.
+that it makes, but not near to all states that it was taken in. In a trial with the plain pair, Nav2D stayed at chance.
 
 With discrete actions and k = 1 the negatives are all other actions. Otherwise they are the actions, or sequences of k
 actions, of the batch's other transitions, unless they equal the positive.
@@ -42,12 +42,12 @@ def info_nce_loss(
     :param pairs: embeddings of both ends of each transition, (batch, 2 features_dim)
     :param candidates: embedded actions, (n_candidates, 2 features_dim)
     :param positives: index of the action taken, int64 (batch,)
-    :param excluded: bool (batch, n_candidates), candidates that are no negatives; the positive's own entry is ignored
+    :param excluded: bool (batch, n_candidates), candidates that are no negatives; the positive's entry is ignored
     """
     logits = -th.cdist(pairs, candidates)
     if excluded is not None:
-        own = nn.functional.one_hot(positives, len(candidates)).bool()
-        logits = logits.masked_fill(excluded & ~own, -math.inf)
+        positive = nn.functional.one_hot(positives, len(candidates)).bool()
+        logits = logits.masked_fill(excluded & ~positive, -math.inf)
     info_nce = nn.functional.cross_entropy(logits, positives)
     return info_nce, {"info_nce": info_nce, "accuracy": (logits.argmax(dim=1) == positives).float().mean()}
 
@@ -58,7 +58,7 @@ class InfoNCE(Objective):
     :param encoder: the network to pretrain
     :param action_space: ``Discrete`` or one-dimensional ``Box``
     :param k: steps of a transition, whose k actions are the positive
-    :param l1_penalty: weight of the L1 norm of both embeddings, as in :mod:`sb3_abisim.objectives.inverse`
+    :param l1_penalty: weight of the L1 norm of both embeddings, as in :mod:`sb3_abisim.objectives.ssi`
     """
 
     name = "info_nce"
@@ -101,8 +101,8 @@ class InfoNCE(Objective):
         else:
             sequences = self.action_inputs(batch.actions).flatten(start_dim=1)
             same = (sequences[:, None] == sequences[None]).all(dim=2)
-            own = th.arange(len(pairs), device=pairs.device)
-            loss, terms = info_nce_loss(pairs, self.action_encoder(sequences), own, excluded=same)
+            positives = th.arange(len(pairs), device=pairs.device)
+            loss, terms = info_nce_loss(pairs, self.action_encoder(sequences), positives, excluded=same)
         l1_norm = (psi.abs().sum(dim=1) + psi_next.abs().sum(dim=1)).mean()
         terms["l1_norm"] = l1_norm
         return loss + self.l1_penalty * l1_norm, {name: term.detach() for name, term in terms.items()}

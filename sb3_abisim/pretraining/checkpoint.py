@@ -11,18 +11,85 @@ from safetensors.torch import save as save_tensors
 from torch import nn
 
 from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.vocabulary import current_settings, current_term
 
+# How many of the newest ones stay.
+N_KEPT = 2
 _HASH_BYTES = 32
 
 
-def save_training_state(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, metadata: dict[str, Any]) -> None:
-    """Write a checkpoint, whole or not at all; a sha256 of the content stands at its end.
+class Checkpoints:
+    """The checkpoints of a run, in its folder.
+
+    :param folder: of the run
+    :param settings: of the run; JSON types, or tuples
+    """
+
+    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        self.folder = folder
+        self.settings = settings
+
+    def save(
+        self, module: nn.Module, optimizer: th.optim.Optimizer, n_updates: int, rows: list[dict[str, float]]
+    ) -> None:
+        """Write a checkpoint, then remove all but the newest two.
+
+        :param module: its parameters and buffers are saved
+        :param optimizer: its state is saved, not its hyperparameters
+        :param n_updates: how many updates were made
+        :param rows: of the log, so far
+        """
+        path = self.folder / f"checkpoint-{n_updates:09d}.safetensors"
+        metadata = {"n_updates": n_updates, "settings": self.settings, "rows": rows}
+        _write(path, module, optimizer, metadata)
+        for old in self._paths()[:-N_KEPT]:
+            old.unlink()
+
+    def restore(self, module: nn.Module, optimizer: th.optim.Optimizer) -> tuple[int, list[dict[str, float]]]:
+        """Put the newest checkpoint, if there is one, back into a module, its optimizer and the random state.
+
+        :param module: gets parameters and buffers
+        :param optimizer: gets its state
+        :return: ``n_updates`` and ``rows`` of :meth:`save`; 0 and none without a checkpoint
+        :raises ValueError: for a damaged file or another run's checkpoint
+        """
+        paths = self._paths()
+        if not paths:
+            return 0, []
+        metadata = _read(paths[-1], module, optimizer, self.settings)
+        rows = [{current_term(name): value for name, value in row.items()} for row in metadata["rows"]]
+        return metadata["n_updates"], rows
+
+    def remove(self) -> None:
+        """Remove them all: only an unfinished run needs them."""
+        for path in self._paths():
+            path.unlink()
+
+    def _paths(self) -> list[Path]:
+        return sorted(self.folder.glob("checkpoint-*.safetensors"))
+
+
+def refuse_other_settings(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
+    """Refuse a file that a run with other settings wrote, whatever its version of this package called them.
 
     :param path: the file
-    :param module: its parameters and buffers are saved
-    :param optimizer: its state is saved, not its hyperparameters
-    :param metadata: JSON types; must hold "settings"
+    :param there: its settings
+    :param here: those of the present run
+    :raises ValueError: with the settings that differ, and both values of each
     """
+    # Through JSON, since that is how the file's settings came back (tuples, for one, became lists).
+    there, here = (current_settings(json.loads(json.dumps(settings))) for settings in (there, here))
+    names = sorted({*there, *here})
+    differences = [f"{n}: {there.get(n)!r} there, {here.get(n)!r} here" for n in names if there.get(n) != here.get(n)]
+    if differences:
+        raise ValueError(
+            f"{path} belongs to a run with other settings ({'; '.join(differences)}); choose another output, or remove "
+            "the file"
+        )
+
+
+def _write(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, metadata: dict[str, Any]) -> None:
+    """Write a checkpoint, whole or not at all; a sha256 of the content stands at its end."""
     tensors = {f"module.{name}": tensor for name, tensor in module.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer.{index}.{name}": th.as_tensor(value) for name, value in state.items()}
@@ -33,18 +100,7 @@ def save_training_state(path: Path, module: nn.Module, optimizer: th.optim.Optim
     write_atomic(path, lambda file: file.write(content + hashlib.sha256(content).digest()))
 
 
-def load_training_state(
-    path: Path, module: nn.Module, optimizer: th.optim.Optimizer, settings: dict[str, Any]
-) -> dict[str, Any]:
-    """Put a checkpoint back into a module, its optimizer and the random state.
-
-    :param path: the file
-    :param module: gets parameters and buffers
-    :param optimizer: gets its state
-    :param settings: of the present run; must equal those of the checkpoint
-    :return: the metadata
-    :raises ValueError: for a damaged file or another run's checkpoint
-    """
+def _read(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, settings: dict[str, Any]) -> dict[str, Any]:
     whole = path.read_bytes()
     content, hash = whole[:-_HASH_BYTES], whole[-_HASH_BYTES:]
     if hashlib.sha256(content).digest() != hash:
@@ -52,12 +108,7 @@ def load_training_state(
     tensors = load_tensors(content)
     header_size = int.from_bytes(content[:8], "little")
     metadata: dict[str, Any] = json.loads(json.loads(content[8 : 8 + header_size])["__metadata__"]["run"])
-    here = json.loads(json.dumps(settings))
-    if metadata["settings"] != here:
-        raise ValueError(
-            f"{path} belongs to a run with other settings ({metadata['settings']} there, {here} here); "
-            "choose another output or remove the folder"
-        )
+    refuse_other_settings(path, metadata["settings"], settings)
     module.load_state_dict({k.removeprefix("module."): v for k, v in tensors.items() if k.startswith("module.")})
     state: dict[int, dict[str, th.Tensor]] = {}
     for name, tensor in tensors.items():

@@ -8,6 +8,12 @@ from typing import Any
 import yaml
 
 from sb3_abisim.common.paths import resource_path
+from sb3_abisim.registry import get_method
+
+# Batches of the eval split that a row of the log is the mean of.
+N_EVAL_BATCHES = 8
+# Arguments of an objective that follow from other settings.
+FOLLOWING = {"k", "encoder", "action_space", "base_encoder"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,8 +26,8 @@ class PretrainConfig:
         the zoo's files
     :param k: steps between the two observations of a transition; ``[fewest, most]`` takes all pairs of observations
         with a number of steps in this range
-    :param chunk_length: batches are made of chunks of so many transitions that follow each other in an episode; above 1,
-        objectives that embed both observations have fewer to embed (docs/pretraining.md)
+    :param chunk_length: batches are made of chunks of this many transitions that follow each other in an episode.
+        Above 1, objectives that embed both observations have fewer to embed (docs/pretraining.md)
     :param eval_fraction: share of the episodes that is only evaluated on, 0 <= eval_fraction < 1
     :param log_interval: updates between two rows of the log
     :param checkpoint_interval: least updates between two checkpoints, each written at a row of the log
@@ -104,17 +110,19 @@ def _is_count(value: Any) -> bool:
 
 
 def load_config(objective: str, env_id: str, overrides: dict[str, Any] | None = None) -> PretrainConfig:
-    """Our settings for an objective and an environment, from ``hyperparams/pretrain/<objective>.yml``.
+    """The settings for a method and an environment, from the method's YAML file.
 
-    :param objective: short name of the objective
-    :param env_id: key in the file; an id that is not there gets the entry ``default``
+    :param objective: name of the method
+    :param env_id: key in the file; an id that is not there gets the entry ``default``, or without a file the defaults
+        of :class:`PretrainConfig`
     :param overrides: settings that replace those of the file; a dotted name such as ``objective_kwargs.c`` replaces
         one entry of a nested setting
-    :raises ValueError: for an unknown setting
+    :raises ValueError: for an unknown method or setting
     """
-    path = resource_path("hyperparams") / "pretrain" / f"{objective}.yml"
-    entries = yaml.safe_load(Path(path).read_text())
-    mapping = dict(entries.get(env_id, entries["default"]))
+    custom = get_method(objective).hyperparams
+    path = resource_path("hyperparams") / "pretrain" / f"{objective}.yml" if custom is None else Path(custom)
+    entries = yaml.safe_load(path.read_text(encoding="utf-8")) if custom is not None or path.is_file() else {}
+    mapping = dict(entries.get(env_id, entries.get("default", {})))
     for name, value in (overrides or {}).items():
         outer, _, inner = name.partition(".")
         if inner and not isinstance(mapping.get(outer, {}), dict):

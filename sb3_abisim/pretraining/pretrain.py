@@ -12,7 +12,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sb3_abisim.common.cli import make_parser, parse_pairs, run
 from sb3_abisim.pretraining.config import PretrainConfig, load_config
@@ -27,7 +27,7 @@ def pretrain(
     objective: str,
     data: str | Path,
     output: str | Path,
-    config: PretrainConfig | None = None,
+    config: PretrainConfig | dict[str, Any] | None = None,
     base: str | None = None,
     seed: int = 0,
     device: str = "auto",
@@ -35,14 +35,15 @@ def pretrain(
     verbose: int = 1,
     callback: "Callback | None" = None,
 ) -> Path:
-    """Train an encoder and write its file and card; go on where an interrupted call with the same arguments stopped.
+    """Train an encoder and write its file and model card; go on where an interrupted call with equal arguments stopped.
 
     :param objective: name of a method that has one, such as "ssi"
-    :param data: folder written by :mod:`sb3_abisim.data.collect`
-    :param output: the encoder file, ending in ``.safetensors``; the card is ``.json`` beside it
-    :param config: settings; None takes ours for the dataset's environment
-    :param base: for an objective that builds on another method's encoder, as "abisim" does on "ssi", its file or name;
-        None pretrains it on the same data first, into ``<output without ending>.base.safetensors``
+    :param data: a dataset's folder
+    :param output: the encoder file, ending in ``.safetensors``; the model card is ``.json`` beside it
+    :param config: settings that replace those of ``hyperparams/pretrain/`` for the dataset's environment, such as
+        ``{"n_updates": 1000, "objective_kwargs.c": 0.9}``; or all of them
+    :param base: file or name of a base encoder, for an objective that builds on another method's, as "abisim" does on
+        "ssi"; None pretrains it on the same data first, into ``<output without ending>.base.safetensors``
     :param seed: of weights and batches
     :param device: "auto", "cpu", "cuda", ...
     :param progress_bar: show one
@@ -57,6 +58,7 @@ def pretrain(
     from sb3_abisim.common.malloc import keep_freed_memory
     from sb3_abisim.data.dataset import TransitionDataset
     from sb3_abisim.networks.base import make_encoder
+    from sb3_abisim.pretraining.card import refuse_to_replace
     from sb3_abisim.pretraining.trainer import PretrainRun, make_objective
 
     get_objective(objective)
@@ -67,22 +69,26 @@ def pretrain(
     output = Path(output)
     if output.suffix != ".safetensors":
         raise ValueError(f"the output must end in .safetensors, got {output}")
-    _check_place_of_card(output.with_suffix(".json"))
+    refuse_to_replace(output.with_suffix(".json"))
     env_id = read_env_id(Path(data))
-    config = config or load_config(objective, env_id)
+    if not isinstance(config, PretrainConfig):
+        config = load_config(objective, env_id, config)
     dataset = TransitionDataset(data, eval_fraction=config.eval_fraction)
     _check_parts(dataset, config)
     if base_method is not None and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
-        # Mistakes in its own settings are found before the base is trained.
+        # Mistakes in the settings of this objective are found before the base is trained.
         stand_in = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
         make_objective(objective, dataset, config, stand_in)
         # Of the same network and data, whatever this one is asked to have.
         base_config = load_config(base_method, env_id)
         base_config = dataclasses.replace(
-            base_config, network=config.network, network_kwargs=config.network_kwargs, eval_fraction=config.eval_fraction,
+            base_config,
+            network=config.network,
+            network_kwargs=config.network_kwargs,
+            eval_fraction=config.eval_fraction,
             batch_size=min(base_config.batch_size, config.batch_size),
-        )  # fmt: skip
+        )
         pretrain(base_method, data, base, base_config, None, seed, device, progress_bar, verbose)
     if base_method is None and base is not None:
         raise ValueError(f"{objective!r} builds on no base encoder, got base={base!r}; leave it out")
@@ -93,7 +99,7 @@ def pretrain(
             remove_temporaries(folder)
             run = PretrainRun(objective, dataset, output, config, base, seed, device, callback)
             if run.is_finished():
-                run.drop_checkpoints()
+                run.checkpoints.remove()
                 if verbose:
                     print(f"{output} is finished already; nothing to do")
                 return output
@@ -116,19 +122,10 @@ def _check_parts(dataset: "TransitionDataset", config: PretrainConfig) -> None:
         try:
             dataset.pairs(config.k, "eval")
         except ValueError as error:
-            what = f"no segment of the eval split of {dataset.path} (eval_fraction {config.eval_fraction}) has a transition of k steps"
-            raise ValueError(f"{what}; collect more transitions, or set eval_fraction:0") from error
-
-
-def _check_place_of_card(path: Path) -> None:
-    """The card's name follows from the encoder's, and may be that of a file which is somebody's own."""
-    if path.exists():
-        try:
-            is_card = "curves" in json.loads(path.read_bytes())
-        except (OSError, ValueError, TypeError):
-            is_card = False
-        if not is_card:
-            raise ValueError(f"the encoder's card would replace {path}, which is none; name another output")
+            raise ValueError(
+                f"the eval split of {dataset.path} (eval_fraction {config.eval_fraction}) has no transition over k = "
+                f"{config.k} steps; collect more transitions, or set eval_fraction:0"
+            ) from error
 
 
 def read_env_id(data: Path) -> str:
@@ -139,19 +136,19 @@ def read_env_id(data: Path) -> str:
     """
     meta_path = data / "meta.json"
     if not meta_path.is_file():
-        raise ValueError(f"{data} holds no finished dataset (no meta.json); run sb3_abisim.data.collect first")
+        raise ValueError(f"{data} holds no finished dataset (no meta.json); make one with sb3-abisim collect")
     try:
         return str(json.loads(meta_path.read_bytes())["env_id"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
-            f"{meta_path} was not written by sb3_abisim.data.collect ({error!r}); give its folder"
+            f"{meta_path} is not that of a dataset ({error!r}); name a folder of sb3-abisim collect"
         ) from error
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """The command; see ``--help``.
 
-    :param argv: its words; the program's arguments by default
+    :param argv: its arguments; None for those of the process
     """
     parser = make_parser(
         "pretrain",

@@ -1,40 +1,32 @@
-"""One pretraining run: its parts, its position, how both are saved, and the training loop."""
+"""The training loop of pretraining."""
 
 import itertools
-import json
-import math
-import platform
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
-from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.utils import get_device
 from tqdm import tqdm
 
-from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.transitions import TransitionBatch
 from sb3_abisim.data.dataset import Split, TransitionDataset
-from sb3_abisim.data.format import CONTENT_HASH_KEY, HASH_KEY
-from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.networks.base import Encoder, make_encoder, preprocess, set_memory_format
 from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
-from sb3_abisim.pretraining.card import reproducing_commands
-from sb3_abisim.pretraining.checkpoint import load_training_state, save_training_state
-from sb3_abisim.pretraining.config import PretrainConfig
+from sb3_abisim.pretraining.card import make_card, warn_at_chance, write_card
+from sb3_abisim.pretraining.checkpoint import Checkpoints, refuse_other_settings
+from sb3_abisim.pretraining.config import FOLLOWING, N_EVAL_BATCHES, PretrainConfig
 from sb3_abisim.registry import get_objective
 
 # From the encoder in evaluation mode to further numbers for a row of the log.
 Callback = Callable[[Encoder], Mapping[str, float]]
 
-# Arguments of an objective that follow from other settings.
-FOLLOWING = {"k", "encoder", "action_space", "base_encoder"}
 N_REFERENCE = 8
 N_STANDARDIZE = 4096
-N_EVAL_BATCHES = 8
 
 
 def make_objective(
@@ -66,7 +58,17 @@ def make_objective(
 
 
 class PretrainRun:
-    """One pretraining run: its parts, its position, and how both are saved."""
+    """One pretraining run: its parts, and the loop that trains them.
+
+    :param objective: name of a method that has one
+    :param dataset: to train on
+    :param output: the encoder file; checkpoints and logs go to the folder ``<output without ending>.run``
+    :param config: the settings
+    :param base: file or name of the base encoder, for an objective that takes one
+    :param seed: of weights and batches
+    :param device: as in Stable-Baselines3
+    :param callback: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
+    """
 
     def __init__(
         self,
@@ -96,17 +98,16 @@ class PretrainRun:
             base_encoder = base_file.encoder
             self.settings["base_hash"] = base_file.hash
             self.settings["base_objective"] = base_file.metadata["objective"]
-        # Weights are drawn on the CPU, so that they do not depend on the device.
+        # Weights are sampled on the CPU, so that they do not depend on the device.
         th.manual_seed(seed)
-        module = make_objective(objective, dataset, config, base_encoder)
+        self.module = make_objective(objective, dataset, config, base_encoder).to(self.device)
         # As encoders lie in memory; decoders, too.
-        self.module: Objective = module.to(self.device, memory_format=th.channels_last)  # type: ignore[call-overload]
+        set_memory_format(self.module, th.channels_last)
         self._trained = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
         self.optimizer = th.optim.Adam(self._trained, lr=config.learning_rate_at(0))
+        self.checkpoints = Checkpoints(self.folder, self.settings)
         self.n_updates = self._saved_at = 0
         self.rows: list[dict[str, float]] = []
-
-    # Position and files.
 
     def is_finished(self) -> bool:
         """Whether the encoder file is there, made with the same settings.
@@ -119,117 +120,18 @@ class PretrainRun:
             settings = load_encoder(self.output).metadata["settings"]
         except EncoderFileError as error:
             raise ValueError(f"{error}. To have it written again, remove it first") from error
-        _refuse_other_settings(self.output, settings, self.settings)
+        refuse_other_settings(self.output, settings, self.settings)
         return True
 
-    def save(self) -> None:
-        """Write a checkpoint, then drop all but the last two."""
-        path = self.folder / f"checkpoint-{self.n_updates:09d}.safetensors"
-        metadata = {"n_updates": self.n_updates, "settings": self.settings, "rows": self.rows}
-        save_training_state(path, self.module, self.optimizer, metadata)
-        self._saved_at = self.n_updates
-        for old in self._checkpoints()[:-2]:
-            old.unlink()
-
-    def restore(self) -> None:
-        """Go on from the newest checkpoint, if there is one."""
-        checkpoints = self._checkpoints()
-        if not checkpoints:
-            return
-        metadata = load_training_state(checkpoints[-1], self.module, self.optimizer, self.settings)
-        self.n_updates, self.rows = metadata["n_updates"], metadata["rows"]
-        self._saved_at = self.n_updates
-
-    def drop_checkpoints(self) -> None:
-        """Remove what only an unfinished run needs."""
-        for checkpoint in self._checkpoints():
-            checkpoint.unlink()
-
-    def _checkpoints(self) -> list[Path]:
-        return sorted(self.folder.glob("checkpoint-*.safetensors"))
-
-    def finish(self) -> None:
-        """Write the card and, last, the encoder file; its presence says that the run is over."""
-        dataset = self.dataset
-        starts = dataset.valid_starts()
-        reference = dataset.frames(starts[:: max(1, len(starts) // N_REFERENCE)][:N_REFERENCE])
-        encoder = self.module.encoder.cpu()
-        encoder.standardize(self._sample_observations())
-        card = self._card(n_parameters=sum(p.numel() for p in encoder.parameters()))
-        text = json.dumps(card, indent=1, sort_keys=True) + "\n"
-        write_atomic(self.output.with_suffix(".json"), lambda file: file.write(text.encode()))
-        save_encoder(
-            self.output,
-            encoder,
-            observation_space=dataset.observation_space,
-            action_space=dataset.action_space,
-            env_id=dataset.env_id,
-            env_kwargs=dataset.env_kwargs,
-            objective=self.settings["objective"],
-            settings=self.settings,
-            dataset_hash=dataset.hash,
-            reference_observations=reference,
-        )
-        self.drop_checkpoints()
-        self._warn_at_chance()
-
-    def _warn_at_chance(self) -> None:
-        """An encoder that has learned nothing looks like any other file."""
-        name = "eval/accuracy" if self.config.eval_fraction else "train/accuracy"
-        accuracy = self.rows[-1].get(name) if self.rows else None
-        batch_size, n = self.config.batch_size, self.config.batch_size * N_EVAL_BATCHES
-        if self.config.eval_fraction:
-            n_eval = len(self.dataset.pairs(self.config.k, "eval")[0])
-            batch_size, n = min(batch_size, n_eval), min(n, n_eval)
-        chance = self.module.chance_accuracy(batch_size)
-        if accuracy is None or chance is None:
-            return
-        if accuracy <= chance + max(0.005, 3 * math.sqrt(chance * (1 - chance) / n)):
-            warnings.warn(
-                f"{self.output}: {name} ended at {accuracy:.3g}, no better than guessing ({chance:.3g}), so the "
-                "encoder has learned nothing of its objective; try more updates, another seed, a smaller l1_penalty "
-                "or, for ssi and acro, a delta_scale above 1",
-                stacklevel=2,
-            )
-
-    def _sample_observations(self) -> th.Tensor:
-        """Observations from all over the dataset, as floats on the CPU."""
-        starts = self.dataset.valid_starts(split="train")
-        frames = self.dataset.frames(starts[:: max(1, len(starts) // N_STANDARDIZE)][:N_STANDARDIZE])
-        observations = preprocess_obs(th.as_tensor(frames), self.dataset.observation_space)
-        assert isinstance(observations, th.Tensor)
-        return observations
-
-    def _card(self, n_parameters: int) -> dict[str, Any]:
-        """What a reader wants to know of an encoder; free of times and paths, so that equal runs write equal cards."""
-        dataset = self.dataset
-        return {
-            "settings": self.settings,
-            "commands": reproducing_commands(self.settings, self.config, dataset.meta),
-            "dataset": {
-                key: dataset.meta[key] for key in (HASH_KEY, "env_id", "env_kwargs", CONTENT_HASH_KEY, "n_transitions")
-            },
-            "features_dim": self.module.encoder.features_dim,
-            "n_parameters": n_parameters,
-            "metrics": self.rows[-1] if self.rows else {},
-            # A callback may have been there for some of the rows only.
-            "curves": {
-                key: [row.get(key) for row in self.rows] for key in dict.fromkeys(k for r in self.rows for k in r)
-            },
-            "versions": {"python": platform.python_version(), "torch": th.__version__.split("+")[0]},
-            "device": self.device.type,
-        }
-
-    # Training.
-
     def train(self, progress_bar: bool, verbose: int) -> None:
-        """Train to the end and write the results.
+        """Train to the end, from the newest checkpoint if there is one, and write the results.
 
         :param progress_bar: show one
         :param verbose: 1 prints the log's rows
         """
         th.manual_seed(self.seed)
-        self.restore()
+        self.n_updates, self.rows = self.checkpoints.restore(self.module, self.optimizer)
+        self._saved_at = self.n_updates
         logger = self._logger(verbose)
         sums: dict[str, float] = {}
         bar = tqdm(
@@ -257,6 +159,41 @@ class PretrainRun:
             bar.close()
             logger.close()
         self.finish()
+
+    def save(self) -> None:
+        """Write a checkpoint."""
+        self.checkpoints.save(self.module, self.optimizer, self.n_updates, self.rows)
+        self._saved_at = self.n_updates
+
+    def finish(self) -> None:
+        """Write the model card and, last, the encoder file; its presence says that the run is over."""
+        dataset, encoder = self.dataset, self.module.encoder.cpu().eval()
+        encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
+        card = make_card(self.settings, self.config, dataset, self.module, self.rows, self.device.type)
+        write_card(self.output.with_suffix(".json"), card)
+        save_encoder(
+            self.output,
+            encoder,
+            observation_space=dataset.observation_space,
+            action_space=dataset.action_space,
+            env_id=dataset.env_id,
+            env_kwargs=dataset.env_kwargs,
+            objective=self.settings["objective"],
+            settings=self.settings,
+            dataset_hash=dataset.hash,
+            reference_observations=self._some_frames(N_REFERENCE),
+        )
+        self.checkpoints.remove()
+        warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval())
+
+    def _some_frames(self, n: int, split: Split | None = None) -> NDArray[np.uint8]:
+        """Frames from all over the dataset, n of them unless there are fewer."""
+        starts = self.dataset.valid_starts(split=split)
+        return self.dataset.frames(starts[:: max(1, len(starts) // n)][:n])
+
+    def _n_eval(self) -> int:
+        """Transitions of the eval split."""
+        return len(self.dataset.pairs(self.config.k, "eval")[0]) if self.config.eval_fraction else 0
 
     def _update(self, batch: TensorBatch) -> dict[str, th.Tensor]:
         """One optimizer step; refuses to go on with numbers that are not finite."""
@@ -295,7 +232,7 @@ class PretrainRun:
 
     def _pass(self, batch_size: int, split: Split, epoch: int = 0, start: int = 0) -> Iterator[TransitionBatch[Any]]:
         sequences = self.module.reads_action_sequences
-        # What is evaluated on is the same for all lengths of runs.
+        # What is evaluated on is the same for all lengths of chunks.
         k, chunk_length = self.config.k, self.config.chunk_length if split == "train" else 1
         return self.dataset.batches(
             batch_size, k, self.seed, epoch, start, split=split, sequences=sequences, chunk_length=chunk_length
@@ -303,16 +240,14 @@ class PretrainRun:
 
     def _to_tensors(self, batch: TransitionBatch[Any]) -> TensorBatch:
         """Through SB3's own preprocessing, so that pretraining sees the numbers that RL will see."""
-        space = self.dataset.observation_space
         # Bytes are put in channels-last order before they become floats, four times as large.
         frames = th.as_tensor(batch.frames).contiguous(memory_format=th.channels_last).to(self.device)
-        observations = preprocess_obs(frames, space)
-        assert isinstance(observations, th.Tensor)
         obs_index, next_obs_index = (
             index if isinstance(index, slice) else th.as_tensor(index).to(self.device)
             for index in (batch.obs_index, batch.next_obs_index)
         )
-        return TensorBatch(observations, th.as_tensor(batch.actions).to(self.device), obs_index, next_obs_index)
+        actions = th.as_tensor(batch.actions).to(self.device)
+        return TensorBatch(preprocess(frames, self.dataset.observation_space), actions, obs_index, next_obs_index)
 
     def _log(self, logger: Logger, sums: dict[str, float]) -> None:
         n = self.n_updates - (int(self.rows[-1]["n_updates"]) if self.rows else 0)
@@ -326,13 +261,12 @@ class PretrainRun:
         logger.dump(self.n_updates)
 
     def _evaluate(self) -> dict[str, float]:
-        """Mean terms over held-out batches; the random state is left as it was."""
+        """Mean terms over batches of the eval split; the random state is left as it was."""
         if not self.config.eval_fraction:
             return {}
         self.module.eval()
         means: dict[str, float] = {}
-        n_eval = len(self.dataset.pairs(self.config.k, "eval")[0])
-        batches = self._pass(min(self.config.batch_size, n_eval), "eval")
+        batches = self._pass(min(self.config.batch_size, self._n_eval()), "eval")
         with th.no_grad(), th.random.fork_rng(devices=[]):
             rows = [self.module.loss(self._to_tensors(b))[1] for b in itertools.islice(batches, N_EVAL_BATCHES)]
         for name in rows[0] if rows else ():
@@ -343,7 +277,7 @@ class PretrainRun:
         if self.callback is None:
             return {}
         self.module.eval()
-        # Whatever it draws, training goes on as without it.
+        # Whatever it samples, training goes on as without it.
         with th.no_grad(), th.random.fork_rng(devices=[]):
             return {name: float(value) for name, value in self.callback(self.module.encoder).items()}
 
@@ -370,14 +304,3 @@ def _device(name: str) -> th.device:
     if not there:
         raise ValueError(f"device {name!r} is not available to this PyTorch; give --device auto or cpu")
     return device
-
-
-def _refuse_other_settings(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
-    # Through JSON, since that is how the file's settings came back (tuples, for one, became lists).
-    here = json.loads(json.dumps(here))
-    keys = sorted(set(there) | set(here))
-    differences = [f"{k}: {there.get(k)!r} there, {here.get(k)!r} here" for k in keys if there.get(k) != here.get(k)]
-    if differences:
-        raise ValueError(
-            f"{path} belongs to another run ({'; '.join(differences)}); choose another output or remove it"
-        )

@@ -1,4 +1,4 @@
-"""What an RL run says about its encoder."""
+"""What an RL run reports of its encoder."""
 
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
@@ -9,12 +9,14 @@ from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
 
 
 class EncoderCallback(BaseCallback):
-    """States the encoders when training starts, refuses to train without their weights, and logs their drift.
+    """Prints the encoders when training starts, refuses to train without their weights, and logs how they change.
 
-    Also states the fingerprint of the clips or scans that the training environment shows, if it has one, and lets torch
-    reuse memory (:mod:`sb3_abisim.common.malloc`). Logs
-    ``encoder/relative_weight_change`` at the end of each rollout: how far the weights have moved from those that training started with,
-    relative to the norm of the latter (the largest value, where actor and critic have encoders of their own).
+    ``encoder/relative_weight_change`` is logged at the end of each rollout: the distance of the weights from those that
+    training started with, relative to the norm of the latter. Where actor and critic have separate encoders, it is the
+    largest value.
+
+    Also prints the content hash of the clips or scans that the training environment shows, if it has one, and lets
+    torch reuse memory (:mod:`sb3_abisim.common.malloc`).
 
     :param verbose: as in Stable-Baselines3
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
@@ -26,8 +28,8 @@ class EncoderCallback(BaseCallback):
         require_weights(self.model)
         self._extractors = [extractor for _, extractor in find_extractors(self.model.policy)]
         for name, extractor in find_extractors(self.model.policy):
-            origin = f"digest {extractor.hash}" if extractor.hash else "random weights"
-            state = "frozen" if extractor.frozen else "trained along"
+            origin = f"hash {extractor.hash}" if extractor.hash else "random weights"
+            state = "frozen" if extractor.frozen else "fine-tuned" if extractor.hash else "trained from scratch"
             print(
                 f"Encoder {name}: {type(extractor).__name__}, source {extractor.source}, {origin}, "
                 f"{extractor.n_parameters} parameters, {state}"
@@ -44,13 +46,13 @@ class EncoderCallback(BaseCallback):
                 )
             print(
                 f"Encoder of the environment: {type(encoding).__name__}, source {encoding.source}, "
-                f"digest {encoding.encoder_file.hash}, {encoding.n_parameters} parameters, frozen"
+                f"hash {encoding.encoder_file.hash}, {encoding.n_parameters} parameters, frozen"
             )
         elif not self._extractors:
             print("Encoder: none of sb3_abisim's, policy_kwargs names another features extractor")
         if self.training_env.has_attr("content_hash"):
             (content_hash,) = self.training_env.get_attr("content_hash", indices=0)
-            print(f"Pictures of the training environment: {content_hash}")
+            print(f"Content hash of the training environment: {content_hash}")
 
     def _on_rollout_end(self) -> None:
         if self._extractors:

@@ -1,4 +1,4 @@
-"""What a model holds, held against what was asked for."""
+"""Checks of loaded models: what a model holds, compared with what was asked for."""
 
 from typing import Any
 
@@ -37,8 +37,8 @@ def require_weights(model: BaseAlgorithm) -> None:
 def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> None:
     """Refuse a model whose extractors are not those that ``policy_kwargs`` would build.
 
-    An encoder file that is not there is taken for the model's: a saved model is complete without it. What an extractor
-    of somebody else holds is for that one to check.
+    An encoder file that is not there is taken for the model's: a saved model is complete without it. A custom extractor
+    has to check what it holds by itself.
 
     :param model: an SB3 model
     :param policy_kwargs: as for a new model
@@ -64,4 +64,4 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
 
 
 def _name(extractor: type[EncoderExtractor], frozen: bool, hash: str | None) -> str:
-    return extractor.__name__ + f", digest {hash}" * (hash is not None) + ", frozen" * frozen
+    return extractor.__name__ + f", hash {hash}" * (hash is not None) + ", frozen" * frozen

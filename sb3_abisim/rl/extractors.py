@@ -1,5 +1,7 @@
 """Features extractors for Stable-Baselines3: a pretrained encoder behind ``features_extractor_class``.
 
+Each registered method has one, made by :func:`extractor_class` and importable by its name, such as ``SSIExtractor``.
+
 What SB3 does to any extractor with its default settings, and where that is stopped here:
 
 * ``ortho_init`` draws the weights of every submodule anew: :meth:`PretrainedExtractor.apply`.
@@ -10,7 +12,9 @@ What SB3 does to any extractor with its default settings, and where that is stop
   ``weights_ready`` says whether weights have come since.
 """
 
+import copyreg
 import functools
+import inspect
 import json
 from typing import Any, ClassVar
 
@@ -21,6 +25,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from sb3_abisim.common.spaces import space_from_json
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import Method, get_method, methods
@@ -74,7 +79,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
 
         :param observations: float (batch, channels, height, width) in 0..1, as SB3 preprocesses images
         :return: the encoder's embedding, float (batch, features_dim)
-        :raises ValueError: if the first pictures that arrive are not in 0..1
+        :raises ValueError: if the first observations that arrive are not in 0..1
         """
         if not self._input_checked:
             self._check_input(observations)
@@ -88,7 +93,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
                 f"observations reach {largest:g}, but encoders take images in 0..1; "
                 "remove normalize_images=False from policy_kwargs"
             )
-        # A black picture proves nothing.
+        # A black observation proves nothing.
         self._input_checked = largest > 0.0
 
     def _flat_weights(self) -> th.Tensor:
@@ -117,7 +122,7 @@ class VanillaExtractor(EncoderExtractor):
         super().__init__(observation_space, make_encoder(observation_space, network, **(network_kwargs or {})))
 
     def apply(self, fn: Any) -> "VanillaExtractor":
-        """As in torch; afterwards drift is measured from the new weights (SB3 initializes through this method).
+        """As in torch; SB3 initializes through this method, so the weight change is measured from the new weights.
 
         :param fn: called on every submodule
         """
@@ -233,38 +238,97 @@ def method_of(extractor: type[EncoderExtractor]) -> str | None:
 
     :param extractor: the class
     """
-    return next((name for name, method in methods().items() if method.extractor == extractor.__name__), None)
+    return next((name for name, method in methods().items() if _is_class_of(method, extractor)), None)
+
+
+def network_arguments(file: EncoderFile) -> dict[str, Any]:
+    """What an extractor must be given beside ``encoder`` to take a file.
+
+    :param file: the encoder file
+    :return: ``network`` and ``network_kwargs``; nothing for the default network of the observation's shape
+    """
+    stored = _json_spec(file.encoder)
+    space = space_from_json(file.metadata["observation_space"])
+    try:
+        # The weights drawn here are thrown away; the caller's random numbers must not depend on that.
+        with th.random.fork_rng(devices=[]):
+            is_default = _json_spec(make_encoder(space)) == stored
+    except ValueError:
+        is_default = False
+    return {} if is_default else {"network": stored["name"], "network_kwargs": stored["kwargs"]}
 
 
 def __getattr__(name: str) -> Any:
     # The classes of methods, also for pickle, which finds a class by its module and name.
+    if name.endswith("Extractor"):
+        return _find_class(name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _find_class(name: str, registered_by: str | None = None) -> type[EncoderExtractor]:
+    """The features extractor of this name.
+
+    :param name: of the class
+    :param registered_by: the module that its method is expected to be registered by, None if that is not known
+    :raises ImportError: when no method has one. Not an ``AttributeError``, which ``load`` of SB3 turns into a warning
+    """
     for method in methods().values():
         if method.extractor == name:
             return _class_of(method)
     known = ", ".join(method.extractor for method in methods().values())
-    raise AttributeError(
-        f"no method has a features extractor {name!r}; known are {known}. Import the package that registers it first "
-        "(--packages)"
+    remedy = f"import {registered_by}" if registered_by else "import the package that registers its method"
+    flag = f"--packages {registered_by}" if registered_by else "--packages"
+    raise ImportError(
+        f"no method has a features extractor {name!r}, only {known}; {remedy} first ({flag} in a command)"
     )
+
+
+def _is_class_of(method: Method, extractor: type) -> bool:
+    return method.extractor == extractor.__name__ and _class_of(method) is extractor
 
 
 @functools.cache
 def _class_of(method: Method) -> type[EncoderExtractor]:
-    if not method.is_pretrained:
-        parents, attributes, what = (VanillaExtractor,), {}, f"{method.label}: the network without pretraining"
-    else:
-        parents, attributes = (PretrainedExtractor,), {"objective": method.name}  # type: ignore[assignment]
-        what = f"Encoder pretrained by {method.label}"
-    doc = f"{what}; parameters as for :class:`{parents[0].__name__}`."
-    if method.extractor == parents[0].__name__:
-        return parents[0]
-    return type(method.extractor, parents, {**attributes, "__module__": __name__, "__doc__": doc})
+    parent: type[EncoderExtractor] = PretrainedExtractor if method.is_pretrained else VanillaExtractor
+    if method.extractor == parent.__name__:
+        return parent
+    attributes: dict[str, Any] = {"__module__": __name__}
+    summary = f"The network without pretraining, for the method ``{method.name}``"
+    if method.is_pretrained:
+        attributes["objective"] = method.name
+        summary = f"An encoder pretrained by {method.label} (``--objective {method.name}``)"
+    _, param, parameters = inspect.cleandoc(parent.__doc__ or "").partition(":param")
+    attributes["__doc__"] = f"{summary}.\n\n{param}{parameters}\n"
+    metaclass = type if _registered_by(method) is None else _ForeignType
+    return metaclass(method.extractor, (parent,), attributes)
+
+
+def _registered_by(method: Method) -> str | None:
+    """The module of another package that brings a method; None for a method of ours, or where it cannot be imported."""
+    module: str | None = getattr(method.objective, "__module__", None)
+    is_ours = module is not None and module.partition(".")[0] == __name__.partition(".")[0]
+    return None if is_ours or module == "__main__" else module
+
+
+class _ForeignType(type):
+    """The type of extractors of other packages' methods: a pickle of one says which module to import."""
+
+
+def _reduce_foreign(extractor: _ForeignType) -> Any:
+    for method in methods().values():
+        if _is_class_of(method, extractor):
+            return _find_class, (extractor.__name__, _registered_by(method))
+    # A subclass that somebody has written: by its module and name, as any class.
+    return extractor.__qualname__
+
+
+copyreg.pickle(_ForeignType, _reduce_foreign)
 
 
 def _check_space(observation_space: gym.Space[Any]) -> None:
     if isinstance(observation_space, spaces.Dict):
         raise ValueError(
-            f"an encoder takes one image, got {observation_space}; build it on one key inside an extractor of your own "
+            f"an encoder takes one image, got {observation_space}; build it on one key inside a custom extractor "
             "for MultiInputPolicy"
         )
     if not is_image_space(observation_space):

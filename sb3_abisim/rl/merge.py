@@ -1,4 +1,4 @@
-"""From a model trained on embeddings (``VecEncodeObservations``) to the equal one that acts on pictures."""
+"""From a model trained on embeddings (``VecEncodeObservations``) to the equal one that acts on observations."""
 
 import argparse
 import io
@@ -24,8 +24,8 @@ def merge_encoder(model: AlgorithmT, encoder: str) -> AlgorithmT:
     The result has the same heads on a frozen features extractor, as if it had been trained through the pixels; it acts
     the same and can be trained further. Saved, it is complete: it loads where the encoder file is absent.
 
-    :param model: of any pixel algorithm, trained on ``VecEncodeObservations``; it is left as it was. A loaded one
-        does not know whether its environment normalized observations: only a model that has it is remerged for that
+    :param model: of any pixel algorithm, trained on ``VecEncodeObservations``; it is left as it was. Normalized
+        embeddings are refused only while the model has its environment: a loaded model does not know of them
     :param encoder: the encoder file that it was trained on, as for ``VecEncodeObservations``
     :return: a model of the same class without an environment, on the same device
     :raises FileNotFoundError: if there is no such encoder
@@ -39,7 +39,7 @@ def merge_encoder(model: AlgorithmT, encoder: str) -> AlgorithmT:
         )
     if model.observation_space.hash != file.hash:
         raise ValueError(
-            f"the model was trained on the embeddings of the encoder with digest {model.observation_space.hash}, "
+            f"the model was trained on the embeddings of the encoder with hash {model.observation_space.hash}, "
             f"but {file.path} has {file.hash}; give the file that it was trained on"
         )
     normalize = model.get_vec_normalize_env()

@@ -1,7 +1,7 @@
-"""An optimizer that gives the encoder a learning rate of its own while it is trained along.
+"""An optimizer that gives a fine-tuned encoder its own learning rate.
 
-Stable-Baselines3 writes one learning rate into every parameter group at each ``train()``, so groups with rates of
-their own do not last. Here each group keeps a factor, which is applied within ``step``.
+Stable-Baselines3 writes one learning rate into every parameter group at each ``train()``, so rates of single groups do
+not last. Here each group keeps a factor, which is applied within ``step``.
 """
 
 import math

@@ -1,16 +1,17 @@
-"""A vectorized environment that shows a frozen encoder's embeddings instead of pictures.
+"""A vectorized environment that gives a frozen encoder's embeddings instead of image observations.
 
-With ``freeze=True`` a features extractor embeds each picture again in every epoch and every update. Here each is
-embedded once, when the environment shows it, and rollouts, replay buffers and updates hold the embeddings.
-``merge_encoder`` afterwards makes the trained model into one that acts on pictures.
+With ``freeze=True`` a features extractor embeds each observation again in every epoch and every update. Here each is
+embedded once, when the environment returns it, and rollouts, replay buffers and updates hold the embeddings.
+``merge_encoder`` makes the trained model into one that acts on image observations.
 """
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.utils import get_device
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_abisim.networks.base import Encoder
@@ -25,7 +26,7 @@ class EncodedBox(spaces.Box):
     embeddings of another one.
 
     :param features_dim: size of the embedding
-    :param digest: sha256 (hexadecimal) of the encoder file
+    :param hash: sha256 (hexadecimal) of the encoder file
     """
 
     def __init__(self, features_dim: int, hash: str) -> None:
@@ -36,7 +37,7 @@ class EncodedBox(spaces.Box):
         return isinstance(other, EncodedBox) and self.hash == other.hash and super().__eq__(other)
 
     def __repr__(self) -> str:
-        return f"EncodedBox({self.shape[0]}, digest={self.hash!r})"
+        return f"EncodedBox({self.shape[0]}, hash={self.hash!r})"
 
 
 class VecEncodeObservations(VecEnvWrapper):
@@ -49,8 +50,8 @@ class VecEncodeObservations(VecEnvWrapper):
           - sb3_abisim.VecEncodeObservations:
               encoder: Nav2D-v0/abisim
 
-    :param venv: shows uint8 images in 0..255, channels first, as the encoder saw in pretraining
-        (``VecTransposeImage`` makes them so)
+    :param venv: gives uint8 images in 0..255, as the encoder saw in pretraining; channels last are put first, as
+        Stable-Baselines3 does for features extractors
     :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
         ``hf://owner/repository/file.safetensors``
     :param objective: refuse an encoder that another objective has trained; None takes any
@@ -64,6 +65,9 @@ class VecEncodeObservations(VecEnvWrapper):
     def __init__(
         self, venv: VecEnv, encoder: str, objective: str | None = None, device: th.device | str = "auto"
     ) -> None:
+        space = venv.observation_space
+        if is_image_space(space) and not is_image_space_channels_first(space):  # type: ignore[arg-type]
+            venv = VecTransposeImage(venv)
         file = load_encoder(encoder)
         if objective is not None:
             check_objective(file, objective)
@@ -79,13 +83,13 @@ class VecEncodeObservations(VecEnvWrapper):
         """Number of the encoder's weights."""
         return sum(parameter.numel() for parameter in self._encoder.parameters())
 
-    def encode(self, frames: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Embed pictures.
+    def encode(self, observations: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Embed observations.
 
-        :param frames: uint8 (batch, channels, height, width)
+        :param observations: uint8 (batch, channels, height, width)
         :return: float32 (batch, features_dim)
         """
-        tensor = th.from_numpy(frames).to(self._device)
+        tensor = th.from_numpy(observations).to(self._device)
         embeddings: NDArray[np.float32] = embed(self._encoder, self.venv.observation_space, tensor).cpu().numpy()
         return embeddings
 
@@ -94,22 +98,22 @@ class VecEncodeObservations(VecEnvWrapper):
 
         :return: float32 (n_envs, features_dim)
         """
-        frames = self.venv.reset()
-        assert isinstance(frames, np.ndarray)
-        return self.encode(frames)
+        observations = self.venv.reset()
+        assert isinstance(observations, np.ndarray)
+        return self.encode(observations)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Wait for the step that ``step_async`` began.
 
         :return: as from any ``VecEnv``, with embeddings for observations and for each ``terminal_observation``
         """
-        frames, rewards, dones, infos = self.venv.step_wait()
-        assert isinstance(frames, np.ndarray)
+        observations, rewards, dones, infos = self.venv.step_wait()
+        assert isinstance(observations, np.ndarray)
         ended = [info for info in infos if "terminal_observation" in info]
         if ended:
-            # One forward for all: the terminal pictures go behind the n_envs current ones.
-            frames = np.concatenate([frames, np.stack([info["terminal_observation"] for info in ended])])
-        embeddings = self.encode(frames)
+            # One forward for all: the terminal observations go behind the n_envs current ones.
+            observations = np.concatenate([observations, np.stack([info["terminal_observation"] for info in ended])])
+        embeddings = self.encode(observations)
         for info, embedding in zip(ended, embeddings[self.num_envs :], strict=True):
             info["terminal_observation"] = embedding
         return embeddings[: self.num_envs], rewards, dones, infos

@@ -1,22 +1,28 @@
 """``sb3-abisim train``, ``enjoy`` and ``zoo``: rl-zoo3's commands with our methods, from any folder."""
 
-import importlib
 import runpy
 import sys
+import warnings
 from collections.abc import Sequence
 
-from sb3_abisim.common.cli import PROGRAM, one_line, parse_pairs
+import gymnasium as gym
+
+from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs
+from sb3_abisim.zoo.manager import MethodExperimentManager
+from sb3_abisim.zoo.methods import grammar
 
 # The commands of rl-zoo3 by name: the module, and an example.
 SCRIPTS = {
     "train": ("rl_zoo3.train", "--algo ppo --env PointMaze-v0 --conf-file abisim,frozen -n 100000"),
-    "enjoy": ("rl_zoo3.enjoy", "--algo ppo --env PointMaze-v0 -f logs"),
+    "enjoy": ("rl_zoo3.enjoy", "--algo ppo --env PointMaze-v0 -f logs --no-render"),
     "record_video": ("rl_zoo3.record_video", "--algo ppo --env PointMaze-v0 -f logs"),
     "plot_train": ("rl_zoo3.plots.plot_train", "-a ppo -e PointMaze-v0 -f logs"),
     "all_plots": ("rl_zoo3.plots.all_plots", "-a ppo -e PointMaze-v0 -f logs -o curves"),
     "plot_from_file": ("rl_zoo3.plots.plot_from_file", "-i curves.pkl"),
 }
-_NAMES = ("train", "enjoy")
+# Those that import packages themselves; train writes their names into the run's folder.
+_WITH_PACKAGES = ("train", "enjoy")
+_PACKAGES = ("--packages", "--gym-packages")
 _PAIRS = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 
 
@@ -38,43 +44,64 @@ def main(argv: Sequence[str]) -> None:
             sys.exit(2)
         prog = f"{prog} {command}"
     module, example = SCRIPTS[command]
+    if {"-h", "--help"} & set(flags):
+        if command == "train":
+            print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
+        print("--packages MODULE ... imports modules that register environments, methods, networks or readers.")
+        print(f"example: {prog} {example}\n")
+    MethodExperimentManager.has_begun = False
     try:
-        words = for_rl_zoo3(flags)
-        if any(flag in ("-h", "--help") for flag in flags):
-            _print_help(prog, command, example)
-        # Teaches rl-zoo3 our methods.
-        importlib.import_module("sb3_abisim.zoo")
+        words, packages = for_rl_zoo3(flags)
+        import_packages(packages)
+        if packages and command in _WITH_PACKAGES:
+            words += ["--gym-packages", *packages]
         sys.argv = [prog, *words]
+        # rl_zoo3.plots imports its commands, which runpy would warn of.
+        warnings.filterwarnings("ignore", "'rl_zoo3.plots", RuntimeWarning)
         runpy.run_module(module, run_name="__main__")
-    except (ValueError, OSError, ImportError, AssertionError) as error:
-        if importlib.import_module("sb3_abisim.zoo.manager").MethodExperimentManager.has_begun:
+    except (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error) as error:
+        # Of TypeErrors, an unknown hyperparameter or argument of an environment is a mistake of the command.
+        is_mistake = not isinstance(error, TypeError) or "unexpected keyword argument" in str(error)
+        if MethodExperimentManager.has_begun or not is_mistake:
             raise
         print(f"{prog}: error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
 
 
-def for_rl_zoo3(flags: Sequence[str]) -> list[str]:
-    """Flags in rl-zoo3's words: our ``--packages``, and ``NAME:VALUE`` pairs, whose values it evaluates as Python.
+def for_rl_zoo3(flags: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Flags in rl-zoo3's form, which evaluates the values of its ``NAME:VALUE`` pairs as Python.
 
     :param flags: as a user types them
+    :return: the flags without those that name packages, and the packages
     :raises ValueError: for a pair that cannot be read
     """
     words: list[str] = []
+    packages: list[str] = []
     option = ""
     for flag in flags:
+        value = flag
         if flag.startswith("-") and not flag[1:2].isdigit():
-            option = flag
-            words.append("--gym-packages" if flag == "--packages" else flag)
+            option, equals, value = flag.partition("=")
+            if option not in (*_PACKAGES, *_PAIRS):
+                words.append(flag)
+                continue
+            if option in _PAIRS:
+                words.append(option)
+            if not equals:
+                continue
+        if option in _PACKAGES:
+            packages.append(value)
         elif option in _PAIRS:
-            words += [f"{name}:{value!r}" for name, value in parse_pairs([flag], option).items()]
+            words += [_pair(name, content, option) for name, content in parse_pairs([value], option).items()]
         else:
-            words.append(flag)
-    return words
+            words.append(value)
+    return words, packages
 
 
-def _print_help(prog: str, command: str, example: str) -> None:
-    from sb3_abisim.zoo.methods import grammar
-
-    if command == "train":
-        print(f"rl-zoo3's {command}; --conf-file also takes {grammar()}.")
-    print(f"--packages MODULE ... is its --gym-packages.\nexample: {prog} {example}\n")
+def _pair(name: str, value: object, option: str) -> str:
+    if "." in name:
+        raise ValueError(
+            f"{option} sets whole hyperparameters, got {name!r}; give {name.partition('.')[0]}, or write a YAML file "
+            "for --conf-file"
+        )
+    return f"{name}:{value!r}"

@@ -1,9 +1,9 @@
 """Evaluate the final model of a zoo run: ``sb3-abisim benchmark evaluate RUN_FOLDER``.
 
-The zoo evaluates during training, deterministically, on one split of the clips. This says how the model that training
-ended with fares with the most likely and with sampled actions, and, in the Distractor environments, on clips that
-training never showed ("eval"), on those that it showed ("train") and without any ("clean"). Every model meets the same
-mazes.
+The zoo evaluates during training, deterministically, on one split of the clips. This evaluates the model that training
+ended with, deterministically and stochastically, and on every split: in the Distractor environments on clips that
+training never showed ("eval"), on those that it showed ("train") and without any ("clean"). Every model is evaluated in
+the same mazes.
 """
 
 import io
@@ -26,14 +26,14 @@ from sb3_abisim.zoo.runs import Run, read_run
 FILE_NAME = "final_evaluations.npz"
 MODES = ("deterministic", "stochastic")
 N_ENVS = 16
-# Far from the small numbers that people train with.
+# Far from the small seeds of training.
 SEED = 1_000_000
 
 
 def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
     """Evaluate the last model of a run and write ``final_evaluations.npz`` into its folder.
 
-    The file holds, for each mode and split (``standard`` where there are no clips), ``<mode>/<split>/results``,
+    The file holds, for each mode and split (``standard`` where there are no splits), ``<mode>/<split>/results``,
     ``/ep_lengths`` and ``/successes``, each of shape (n_episodes,).
 
     :param folder: of a zoo run that has ended
@@ -60,7 +60,7 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
 
 
 def final_model(run: Run) -> BaseAlgorithm:
-    """The model that a run ended with, on the CPU; it acts on pictures, whatever it was trained on.
+    """The model that a run ended with, on the CPU; it acts on observations, whatever it was trained on.
 
     :param run: a zoo run
     :raises ValueError: if the run has not ended, if its environment is not registered, or if it had wrappers around it
@@ -87,13 +87,13 @@ def final_model(run: Run) -> BaseAlgorithm:
         raise ValueError(f"{run.folder} holds no final model ({path.name}); let the run end first")
     model: BaseAlgorithm = ALGOS[run.algo].load(path, device="cpu")
     if isinstance(model.observation_space, EncodedBox):
-        # Trained on embeddings, and the environments show pictures.
+        # Trained on embeddings, and the environments here give observations.
         model = merge_encoder(model, str(run.folder / run.env_name / RUN_COPY))
     return model
 
 
 def not_rebuilt(settings: Mapping[str, Any]) -> list[str]:
-    """What a model saw its environment through in training, and the environments here are made without.
+    """The wrappers that a model was trained with, and that the environments here are made without.
 
     :param settings: of the zoo
     :return: names of wrappers; empty where the final evaluation is as training was
@@ -109,11 +109,11 @@ def not_rebuilt(settings: Mapping[str, Any]) -> list[str]:
 
 
 def split_kwargs(env_id: str, env_kwargs: dict[str, Any], split: str | None) -> dict[str, Any]:
-    """Arguments of an environment like the one of training, on other clips.
+    """Arguments of the environment of training, on another split.
 
     :param env_id: trained in
     :param env_kwargs: of training
-    :param split: of the clips, None for an environment without any
+    :param split: None for an environment without splits
     """
     if split is None:
         return env_kwargs

@@ -1,38 +1,41 @@
 """rl-zoo3's experiment manager with our hyperparameters, methods and evaluation splits.
 
-For the environments in ``hyperparams/*.yml`` of this package:
+For the environments of this package:
 
-* without ``--conf-file``, the hyperparameters are those of this package;
-* evaluation of environments with splits (moving backgrounds) is on the evaluation split, unless ``--eval-env-kwargs``
-  gives another one.
+* without ``--conf-file``, the hyperparameters are those of ``hyperparams/*.yml``;
+* evaluation is in the environment of training, on the evaluation split where there are splits (moving backgrounds),
+  unless ``--eval-env-kwargs`` gives another one.
 
 For every environment:
 
 * ``--conf-file METHOD[=ENCODER][,frozen]`` keeps the hyperparameters and replaces the features extractor; frozen, it
   puts ``VecEncodeObservations`` in its place;
+* ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
 * a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
 * ``-optimize`` keeps a features extractor of this package, which rl-zoo3 alone would drop (rl-zoo3#431).
 """
 
 import copy
+import dataclasses
 import functools
 import importlib
+import inspect
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import rl_zoo3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
-from sb3_abisim.rl.checks import check_trained_with
+from sb3_abisim.rl.checks import check_trained_with, find_extractors
 from sb3_abisim.rl.extractors import EncoderExtractor, method_of
 from sb3_abisim.zoo.methods import (
     PREPROCESSING_KEYS,
@@ -65,8 +68,8 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     eval_env_kwargs: dict[str, Any]
     vec_env_class: type
     _hyperparams: dict[str, Any]
-    _spec: MethodSpec | None
-    # Whether a run of this process has begun to learn: errors before that are mistakes of the command.
+    _spec: MethodSpec | None = None
+    # Whether a run of this process has begun to train: errors before that are mistakes of the command.
     has_begun = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -78,17 +81,13 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         env_id = self.env_name.gym_id
         is_default = Path(self.config).parent == zoo_hyperparams()
         self._spec = None if is_default else MethodSpec.of_conf_file(self.config)
+        if self.trial_id is not None and (self._spec is not None or env_id in ENV_IDS):
+            raise ValueError(
+                "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
+                "give the trial's values with -params instead"
+            )
         if is_default or self._spec is not None:
-            ours = hyperparameters_file(self.algo, env_id)
-            if ours is not None and self.trial_id is not None:
-                raise ValueError(
-                    "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
-                    "give the trial's values with -params instead"
-                )
-            if ours is not None:
-                self.config = str(ours)
-            elif self._spec is not None:
-                self.config = str(zoo_hyperparams() / f"{self.algo}.yml")
+            self.config = str(hyperparameters_file(self.algo, env_id) or zoo_hyperparams() / f"{self.algo}.yml")
         if self._spec is not None:
             custom = self.custom_hyperparams or {}
             entry = hyperparameters_entry(self.algo, env_id)
@@ -96,8 +95,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         hyperparams, saved_hyperparams = super().read_hyperparameters()
         self._check_embeddings(hyperparams)
         self._set_batched_vec_env(hyperparams)
-        if self._spec is not None or batch_class(env_id) is not None:
-            self._set_eval_env_kwargs(hyperparams)
+        self._set_eval_env_kwargs(hyperparams)
         return hyperparams, saved_hyperparams
 
     def _check_embeddings(self, hyperparams: dict[str, Any]) -> None:
@@ -120,13 +118,14 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             self.vec_env_class = BatchedVecEnv
 
     def _set_eval_env_kwargs(self, hyperparams: dict[str, Any]) -> None:
-        traits = get_traits(self.env_name.gym_id)
+        env_id = self.env_name.gym_id
+        traits = get_traits(env_id)
         shared = hyperparams.get("env_kwargs", self.env_kwargs)
         # Hyperparameters are selected on what training sees, so that the evaluation split stays unseen.
         if traits.eval_split is not None and not self.optimize_hyperparameters:
             shared = {name: value for name, value in shared.items() if name not in traits.split_kwargs}
             self.eval_env_kwargs = {"split": traits.eval_split, **shared, **(self._eval_env_kwargs_args or {})}
-        elif not self._eval_env_kwargs_args:
+        elif not self._eval_env_kwargs_args and (self._spec is not None or env_id in ENV_IDS):
             # rl-zoo3 takes those of --env-kwargs alone, and an environment with other arguments may be another task.
             self.eval_env_kwargs = shared
 
@@ -137,41 +136,47 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         """
         self._used = dict(hyperparams)
         processed, *rest = super()._preprocess_hyperparams(hyperparams)
-        kwargs = resolve_classes(processed.get("policy_kwargs"))
+        kwargs = processed.get("policy_kwargs")
         if self._spec is not None and isinstance(self._used.get("policy_kwargs"), str):
             # A text, which rl-zoo3 has just evaluated.
-            kwargs = {**kwargs, **resolve_classes(self._spec.extractor_kwargs())}
+            kwargs = self._spec.policy_kwargs(kwargs)
         if kwargs is not None:
-            processed["policy_kwargs"] = kwargs
-        self._record = self._make_record(kwargs or {})
+            processed["policy_kwargs"] = resolve_classes(kwargs)
+        self._policy_kwargs: dict[str, Any] = dict(processed.get("policy_kwargs") or {})
         return processed, *rest
 
-    def _make_record(self, policy_kwargs: dict[str, Any]) -> MethodRecord:
+    def create_log_folder(self) -> None:
+        """As rl-zoo3 does, unless the encoder is missing."""
+        self._record = self._make_record()
+        super().create_log_folder()
+
+    def _make_record(self) -> MethodRecord:
         preprocessing = {key: self._used[key] for key in PREPROCESSING_KEYS if key in self._used}
         encoding = encoding_kwargs(self._used)
-        extractor = policy_kwargs.get("features_extractor_class")
         if encoding is not None:
-            encoder = encoding["encoder"]
-            file = load_encoder(encoder)
-            return MethodRecord(file.metadata["objective"], True, encoder, file.hash, preprocessing)
+            file = load_encoder(encoding["encoder"])
+            return MethodRecord(file.metadata["objective"], True, str(encoding["encoder"]), file.hash, preprocessing)
+        extractor = self._policy_kwargs.get("features_extractor_class")
         if not (isinstance(extractor, type) and issubclass(extractor, EncoderExtractor)):
             return MethodRecord(None, False, None, None, preprocessing)
-        kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
+        kwargs = self._policy_kwargs.get("features_extractor_kwargs") or {}
         encoder, hash = kwargs.get("encoder"), None
         if encoder is not None:
             try:
                 hash = load_encoder(encoder).hash
             except EncoderNotFoundError:
-                # A saved model that is continued is complete without it; training a new one is refused later.
-                hash = None
-        return MethodRecord(method_of(extractor), bool(kwargs.get("freeze", False)), encoder, hash, preprocessing)
+                # A saved model is complete without it.
+                if not self.continue_training:
+                    raise
+        name = None if encoder is None else str(encoder)
+        return MethodRecord(method_of(extractor), bool(kwargs.get("freeze", False)), name, hash, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does.
 
         :param model: to train
         """
-        type(self).has_begun = True
+        MethodExperimentManager.has_begun = True
         super().learn(model)
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
@@ -190,6 +195,10 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         except ValueError as error:
             env.close()
             raise ValueError(f"cannot continue {self.trained_agent}: {error}; give the same --conf-file") from error
+        if self._record.encoder is not None and self._record.encoder_hash is None:
+            # The file is gone, and the model knows which one it was.
+            _, extractor = find_extractors(model.policy)[0]
+            self._record = dataclasses.replace(self._record, encoder_hash=extractor.hash)
         return model
 
     def hyperparameters_optimization(self) -> None:
@@ -197,6 +206,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         extractor = (self._hyperparams.get("policy_kwargs") or {}).get("features_extractor_class")
         if isinstance(extractor, type) and issubclass(extractor, EncoderExtractor):
             self._hyperparams = _KeepExtractor(self._hyperparams)
+        MethodExperimentManager.has_begun = True
         super().hyperparameters_optimization()
 
 
@@ -216,36 +226,36 @@ def with_eval_split(make_env: Callable[..., Any]) -> Callable[..., Any]:
 
     :param make_env: ``rl_zoo3.utils.create_test_env``
     """
+    signature = inspect.signature(make_env)
 
     @functools.wraps(make_env)
-    def create_test_env(
-        env_id: str,
-        n_envs: int = 1,
-        stats_path: str | None = None,
-        *args: Any,
-        hyperparams: dict[str, Any] | None = None,
-        env_kwargs: dict[str, Any] | None = None,
-        **kwargs: Any,
-    ) -> Any:
-        traits = get_traits(env_id)
-        given = env_kwargs or {}
-        if traits.eval_split is not None and not set(traits.split_kwargs) & set(given):
-            env_kwargs = {"split": traits.eval_split, **given}
-        hyperparams = copy.deepcopy(hyperparams)
-        encoding = encoding_kwargs(hyperparams or {})
-        if encoding is not None and stats_path is not None and (Path(stats_path) / RUN_COPY).is_file():
-            encoding["encoder"] = str(Path(stats_path) / RUN_COPY)
-        return make_env(
-            env_id, n_envs, stats_path, *args, hyperparams=hyperparams, env_kwargs=env_kwargs, **kwargs
-        )  # fmt: skip
+    def create_test_env(*args: Any, **kwargs: Any) -> Any:
+        given = signature.bind(*args, **kwargs).arguments
+        traits = get_traits(given["env_id"])
+        env_kwargs = given.get("env_kwargs") or {}
+        if traits.eval_split is not None and not set(traits.split_kwargs) & set(env_kwargs):
+            given["env_kwargs"] = {"split": traits.eval_split, **env_kwargs}
+        run_copy = Path(given.get("stats_path") or "") / RUN_COPY
+        if run_copy.is_file() and encoding_kwargs(given.get("hyperparams") or {}) is not None:
+            hyperparams = given["hyperparams"]
+            hyperparams["vec_env_wrapper"] = copy.deepcopy(hyperparams["vec_env_wrapper"])
+            (encoding_kwargs(hyperparams) or {})["encoder"] = str(run_copy)
+        return make_env(**given)
 
-    create_test_env.is_ours = True  # type: ignore[attr-defined]
     return create_test_env
+
+
+# What rl-zoo3 has, and what stands in its place.
+_REPLACED = {
+    "ExperimentManager": (exp_manager.ExperimentManager, MethodExperimentManager),
+    "create_test_env": (rl_utils.create_test_env, with_eval_split(rl_utils.create_test_env)),
+}
 
 
 def install() -> None:
     """Make rl-zoo3's commands use this manager; a second call does nothing."""
-    exp_manager.ExperimentManager = MethodExperimentManager
-    if not hasattr(rl_utils.create_test_env, "is_ours"):
-        rl_utils.create_test_env = with_eval_split(rl_utils.create_test_env)
-        rl_zoo3.create_test_env = rl_utils.create_test_env
+    # Everywhere: with --gym-packages, the command has copied the names by `from ... import` before it imports us.
+    for module in list(sys.modules.values()):
+        for name, (plain, ours) in _REPLACED.items():
+            if getattr(module, "__dict__", {}).get(name) is plain:
+                setattr(module, name, ours)

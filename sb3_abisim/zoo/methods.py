@@ -13,9 +13,12 @@ import yaml
 
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
+from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
+from sb3_abisim.rl.extractors import network_arguments
 
 ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
+ENCODER_CALLBACK = "sb3_abisim.EncoderCallback"
 # Beside config.yml in a run's folder.
 RECORD_NAME = "method.json"
 # Of policy_kwargs: what a YAML names by its dotted path.
@@ -71,7 +74,8 @@ class MethodSpec:
         """
         if re.split("[=,]", config)[0] in methods():
             return cls.parse(config)
-        if not config.endswith((".yml", ".yaml", ".py")) and importlib.util.find_spec(config.partition(".")[0]) is None:
+        module = config.partition(".")[0]
+        if not config.endswith((".yml", ".yaml", ".py")) and not (module and importlib.util.find_spec(module)):
             raise ValueError(
                 f"--conf-file {config!r} is no YAML or Python file, module or method; a method is {grammar()}"
             )
@@ -80,45 +84,46 @@ class MethodSpec:
     def hyperparameters(self, entry: Mapping[str, Any], given: Collection[str] = ()) -> dict[str, Any]:
         """What this method puts in place of an entry's values; all else stays.
 
-        :param entry: of a zoo YAML; where its ``policy_kwargs`` name a shipped encoder ("Nav2D-v0/abisim"), a method
-            without an encoder takes its own of the same environment
+        :param entry: of a zoo YAML
         :param given: names of hyperparameters that the user sets
-        :return: ``policy``, and for a frozen encoder ``vec_env_wrapper``; ``policy_kwargs``, unless the entry gives
-            them as a text, which :meth:`extractor_kwargs` joins once rl-zoo3 has evaluated it
-        :raises ValueError: when the method has no encoder, or sets what the user sets
+        :return: ``policy_kwargs``, unless the entry gives them as a text: :meth:`policy_kwargs` takes them once rl-zoo3
+            has evaluated it; ``policy`` and, for a frozen encoder, ``vec_env_wrapper``; ``callback``, where the entry
+            has no ``EncoderCallback``
+        :raises ValueError: when the method has no encoder, the policy takes none, or the method sets what the user sets
         """
         replaced: dict[str, Any] = {}
-        kwargs = entry.get("policy_kwargs") or {}
+        kwargs, encoder = entry.get("policy_kwargs") or {}, None
         if isinstance(kwargs, Mapping):
-            encoder = (kwargs.get("features_extractor_kwargs") or {}).get("encoder")
-            own = self.extractor_kwargs(encoder)
-            rest = {name: value for name, value in kwargs.items() if not name.startswith("features_extractor_")}
-            replaced["policy_kwargs"] = {**own, **rest}
-        else:
-            encoder = None
-        policy = str(entry.get("policy", "CnnPolicy"))
-        # An entry for vectors, as rl-zoo3's "default" is, has the policy without an extractor for images.
-        replaced["policy"] = policy.replace("Cnn", "Mlp") if self.frozen else policy.replace("Mlp", "Cnn")
+            encoder = _encoder_name(kwargs)
+            replaced["policy_kwargs"] = self.policy_kwargs(kwargs)
         if self.frozen:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
-            replaced["vec_env_wrapper"] = [wrapper]
-        for name in sorted(replaced.keys() & set(given)):
+            replaced["vec_env_wrapper"] = [*_items(entry.get("vec_env_wrapper")), wrapper]
+        if self.frozen or "policy" not in given:
+            replaced["policy"] = self._policy(str(entry.get("policy")))
+        for name in sorted({"policy_kwargs", *replaced} & set(given)):
             raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
+        callbacks = _items(entry.get("callback"))
+        if "callback" not in given and ENCODER_CALLBACK.rpartition(".")[2] not in map(_class_name, callbacks):
+            replaced["callback"] = [*callbacks, ENCODER_CALLBACK]
         return replaced
 
-    def extractor_kwargs(self, shipped: str | None = None) -> dict[str, Any]:
-        """The part of ``policy_kwargs`` that chooses the features extractor, classes by their dotted path.
+    def policy_kwargs(self, kwargs: Mapping[str, Any]) -> dict[str, Any]:
+        """``policy_kwargs`` with this method's features extractor in place of theirs, its class by the dotted path.
 
-        :param shipped: name of a shipped encoder of the environment, of any method; None if there is none
+        :param kwargs: of an entry; where they name a shipped encoder ("Nav2D-v0/abisim"), a method without an encoder
+            takes the one of the same environment that it has trained
         :raises ValueError: when the method needs an encoder, and there is none
         """
-        if self.frozen:
-            return {}
+        replaced = {name: value for name, value in kwargs.items() if not name.startswith("features_extractor_")}
         method = get_method(self.name)
-        kwargs: dict[str, Any] = {"features_extractor_class": f"sb3_abisim.{method.extractor}"}
+        if self.frozen:
+            return replaced
+        replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
         if method.is_pretrained:
-            kwargs["features_extractor_kwargs"] = {"encoder": self._encoder(shipped)}
-        return kwargs
+            encoder = self._encoder(_encoder_name(kwargs))
+            replaced["features_extractor_kwargs"] = {"encoder": encoder, **_network_arguments(encoder)}
+        return replaced
 
     def _encoder(self, shipped: str | None) -> str:
         if self.encoder is not None:
@@ -130,12 +135,24 @@ class MethodSpec:
             )
         return f"{shipped.rpartition('/')[0]}/{self.name}"
 
+    def _policy(self, policy: str) -> str:
+        # An entry for vectors, as rl-zoo3's "default" is, has the policy without an extractor for images.
+        wrong, right = ("Cnn", "Mlp") if self.frozen else ("Mlp", "Cnn")
+        replaced = policy.replace(wrong, right)
+        # A dotted path is a custom policy.
+        if right not in replaced and "." not in replaced:
+            raise ValueError(
+                f"--conf-file {self.name} needs a policy for one image observation, and {policy} is none; choose "
+                "another algorithm with --algo, or write a YAML file for this environment"
+            )
+        return replaced
+
 
 @dataclass(frozen=True)
 class MethodRecord:
     """What a run used, written beside its configuration as JSON; reports read it.
 
-    :param method: a registered name; None for a features extractor that is none of ours
+    :param method: a registered name; None for a features extractor of no method
     :param frozen: whether the weights stayed as they were
     :param encoder: path or name of the encoder file; None without one
     :param encoder_hash: sha256 of the encoder file; None without one
@@ -150,7 +167,7 @@ class MethodRecord:
 
     @property
     def label(self) -> str | None:
-        """What reports call it: "abisim", "abisim,frozen"; None for no method of ours."""
+        """What reports call it: "abisim", "abisim,frozen"; None for no method."""
         return None if self.method is None else self.method + ",frozen" * self.frozen
 
     def write(self, folder: str | Path) -> None:
@@ -158,7 +175,8 @@ class MethodRecord:
 
         :param folder: exists
         """
-        text = json.dumps(asdict(self), indent=1, sort_keys=True) + "\n"
+        # Wrappers of a Python configuration may be classes.
+        text = json.dumps(asdict(self), indent=1, sort_keys=True, default=str) + "\n"
         write_atomic(Path(folder) / RECORD_NAME, lambda file: file.write(text.encode()))
 
     @classmethod
@@ -197,7 +215,7 @@ def hyperparameters_file(algo: str, env_id: str) -> Path | None:
     known = ", ".join(path.stem for path in files)
     raise ValueError(
         f"sb3_abisim has no hyperparameters of {algo} for {env_id}, only of: {known}; "
-        "choose one of these with --algo, or give a YAML file of your own with --conf-file"
+        "choose one of these with --algo, or give a custom YAML file with --conf-file"
     )
 
 
@@ -263,13 +281,35 @@ def encoding_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any] | None:
 
     :param hyperparams: of a zoo entry, or of a run's ``config.yml``
     """
-    wrappers: Any = hyperparams.get("vec_env_wrapper")
-    for wrapper in wrappers if isinstance(wrappers, list) else [wrappers]:
-        name = next(iter(wrapper), "") if isinstance(wrapper, dict) else ""
-        if name.rpartition(".")[2] == ENCODING_WRAPPER.rpartition(".")[2]:
-            kwargs: dict[str, Any] = wrapper[name]
+    for wrapper in _items(hyperparams.get("vec_env_wrapper")):
+        if isinstance(wrapper, dict) and _class_name(wrapper) == ENCODING_WRAPPER.rpartition(".")[2]:
+            kwargs: dict[str, Any] = next(iter(wrapper.values()))
             return kwargs
     return None
+
+
+def _items(value: Any) -> list[Any]:
+    """The items of a zoo entry's ``vec_env_wrapper`` or ``callback``, which may be one, several or None."""
+    return value if isinstance(value, list) else [] if value is None else [value]
+
+
+def _class_name(item: Any) -> str:
+    """The name of the class that an item of :func:`_items` names, with or without arguments."""
+    name = next(iter(item), "") if isinstance(item, dict) else item
+    return str(getattr(name, "__name__", name)).rpartition(".")[2]
+
+
+def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:
+    encoder = (policy_kwargs.get("features_extractor_kwargs") or {}).get("encoder")
+    return None if encoder is None else str(encoder)
+
+
+def _network_arguments(encoder: str) -> dict[str, Any]:
+    try:
+        return network_arguments(load_encoder(encoder))
+    except EncoderNotFoundError:
+        # Whoever needs the file says so; a saved model that is continued is complete without it.
+        return {}
 
 
 def normalizes_observations(normalize: Any) -> bool:

@@ -1,4 +1,4 @@
-"""A GIF of the agent that a zoo run ended with.
+"""``sb3-abisim record``: a GIF of the agent that a zoo run ended with.
 
 rl-zoo3's ``record_video`` makes an MP4. A GIF plays in a README and in any browser.
 """
@@ -20,22 +20,22 @@ from sb3_abisim.zoo.runs import read_run
 if TYPE_CHECKING:
     from PIL import Image
 
-# Of each picture; GIF counts in hundredths of a second.
+# Of each frame; GIF counts in hundredths of a second.
 MILLISECONDS = 80
-# The last of an episode is shown this many times.
+# The last frame of an episode is shown this many times.
 N_LAST = 12
 PIXELS = 192
-# Pictures of an episode; of a longer one every second, third, ... is shown.
-MAX_PICTURES = 128
+# Frames of an episode; of a longer one every second, third, ... is shown.
+MAX_FRAMES = 128
 
 
 def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: int = 0) -> float:
-    """Record the final model of a run, in its environment (Distractor environments: on unseen clips).
+    """Record the final model of a run, in its environment, on the evaluation split where there are splits.
 
-    Actions are sampled: the most likely ones can get stuck at a corner.
+    The policy is stochastic: a deterministic one can get stuck at a corner.
 
     :param run_folder: zoo run folder that has ended
-    :param path: the GIF to write; its last picture of an episode stays for a second
+    :param path: the GIF to write; the last frame of an episode stays for a second
     :param n_episodes: at least 1
     :param seed: of the episodes and of the actions
     :return: share of the recorded episodes that were successful
@@ -51,29 +51,29 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
     kwargs = split_kwargs(zoo_run.env_id, zoo_run.env_kwargs, get_traits(zoo_run.env_id).eval_split)
     env = gym.make(zoo_run.env_id, render_mode="rgb_array", **kwargs)
     set_random_seed(seed)
-    pictures: list[Image.Image] = []
+    frames: list[Image.Image] = []
     successes = 0
     try:
         for episode in range(n_episodes):
             observation, _ = env.reset(seed=seed + episode)
-            seen, over = [_picture(env.render())], False
+            shown, done = [_frame(env.render())], False
             state: Any = None
-            while not over:
-                begins = np.array([state is None])
-                action, state = model.predict(observation, state, begins, deterministic=False)
+            while not done:
+                episode_start = np.array([state is None])
+                action, state = model.predict(observation, state, episode_start, deterministic=False)
                 observation, _, terminated, truncated, info = env.step(action)
-                seen.append(_picture(env.render()))
-                over = terminated or truncated
+                shown.append(_frame(env.render()))
+                done = terminated or truncated
             successes += bool(info.get("is_success", False))
-            pictures += seen[:: -(-len(seen) // MAX_PICTURES)] + [seen[-1]] * (N_LAST - 1)
+            frames += shown[:: -(-len(shown) // MAX_FRAMES)] + [shown[-1]] * (N_LAST - 1)
     finally:
         env.close()
-    rest = {"save_all": True, "append_images": pictures[1:], "duration": MILLISECONDS, "loop": 0}
-    write_atomic(Path(path), lambda file: pictures[0].save(file, format="GIF", **rest))
+    rest = {"save_all": True, "append_images": frames[1:], "duration": MILLISECONDS, "loop": 0}
+    write_atomic(Path(path), lambda file: frames[0].save(file, format="GIF", **rest))
     return successes / n_episodes
 
 
-def _picture(rendered: Any) -> "Image.Image":
+def _frame(rendered: Any) -> "Image.Image":
     from PIL import Image
 
     small = Image.fromarray(rendered).resize((PIXELS, PIXELS))

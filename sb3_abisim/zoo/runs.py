@@ -18,7 +18,7 @@ from sb3_abisim.zoo.methods import MethodRecord, encoding_kwargs
 
 
 class _Loader(yaml.SafeLoader):
-    """The zoo writes ``!!python`` tags; these two are data, all others are refused."""
+    """The zoo writes ``!!python`` tags; the three below are data, all others are refused."""
 
 
 _Loader.add_constructor(
@@ -60,7 +60,7 @@ class Run:
     """A zoo run.
 
     :param folder: where it lies
-    :param label: the method, such as "abisim,frozen", or the algorithm without a method of ours
+    :param label: the method, such as "abisim,frozen", or the algorithm without one
     :param record: what it used; None for a run of plain rl-zoo3
     :param env_id: trained in
     :param env_name: what rl-zoo3 makes of it in the names of files (my-Toy-v0 for my/Toy-v0)
@@ -97,11 +97,11 @@ class Run:
         return _read_curve(path)
 
     def training(self, n_points: int = 50) -> Curve:
-        """The episodes of training itself, with the exploring policy, averaged over equal stretches of steps.
+        """The episodes of training itself, with the exploring policy, averaged over equal bins of steps.
 
-        Exported runs hold this curve instead of the episodes, with the default number of stretches.
+        Exported runs hold this curve instead of the episodes, with the default number of bins.
 
-        :param n_points: stretches; those in which no episode ended are left out
+        :param n_points: number of bins; those in which no episode ended are left out
         :raises ValueError: if there are neither episodes nor their curve
         """
         from stable_baselines3.common.monitor import load_results
@@ -116,11 +116,11 @@ class Run:
         if not len(episodes):
             raise NoEpisodesError(f"no episode of {self.folder} has ended yet; try again later, or leave the run out")
         ends = episodes["l"].cumsum().to_numpy()
-        stretch = np.minimum((ends - 1) * n_points // max(self.n_timesteps, int(ends[-1])), n_points - 1)
+        bin_index = np.minimum((ends - 1) * n_points // max(self.n_timesteps, int(ends[-1])), n_points - 1)
         width = max(self.n_timesteps, int(ends[-1])) / n_points
-        kept = np.unique(stretch)
+        kept = np.unique(bin_index)
         columns = [episodes[name].to_numpy(float) for name in ("r", "is_success") if name in episodes]
-        means = [np.array([column[stretch == k].mean() for k in kept]) for column in columns]
+        means = [np.array([column[bin_index == k].mean() for k in kept]) for column in columns]
         return Curve(((kept + 1) * width).astype(np.int64), means[0], means[1] if len(means) == 2 else None)
 
     def final(self) -> dict[str, NDArray[Any]] | None:
@@ -163,7 +163,7 @@ def read_run(folder: str | Path) -> Run:
         # What names the encoder's file differs between encoder seeds; the label says whatever else is in there.
         plain = {name: value for name, value in config.items() if name not in ("policy_kwargs", "n_timesteps")}
         (encoding_kwargs(plain) or {}).pop("encoder", None)
-        plain["policy_kwargs"] = _without_encoder(config.get("policy_kwargs"))
+        plain["policy_kwargs"] = _without_encoder(config.get("policy_kwargs"), record)
         names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
         return Run(
             folder=folder,
@@ -186,7 +186,7 @@ def read_run(folder: str | Path) -> Run:
 def find_runs(folder: str | Path) -> list[Run]:
     """All runs below a folder, or those of the last command of a benchmark's folder.
 
-    :param folder: a benchmark's folder, a zoo's log folder, or a run's own
+    :param folder: a benchmark's folder, a zoo's log folder, or the folder of a run
     :raises ValueError: if there are none
     """
     folder = Path(folder)
@@ -200,7 +200,7 @@ def find_runs(folder: str | Path) -> list[Run]:
         ]
     else:
         paths = sorted(path.parent.parent for path in folder.glob("**/args.yml"))
-        # Where a benchmark's cells work is nothing that is done.
+        # Where a benchmark's jobs work, nothing has ended.
         runs = [read_run(path) for path in paths if not path.relative_to(folder).as_posix().startswith("work/run-")]
     if not runs:
         raise ValueError(f"no run folders of rl-zoo3 below {folder}; train first, or give its log folder")
@@ -208,7 +208,7 @@ def find_runs(folder: str | Path) -> list[Run]:
 
 
 def is_deterministic(env_id: str) -> bool | None:
-    """Whether the zoo's evaluations during training take the most likely action.
+    """Whether the zoo's evaluations during training are deterministic.
 
     :param env_id: trained in
     :return: None where the environment is not registered here
@@ -233,8 +233,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise ValueError(f"cannot read {path} ({error}); was it written by rl_zoo3.train?") from error
 
 
-def _without_encoder(policy_kwargs: Any) -> Any:
+def _without_encoder(policy_kwargs: Any, record: MethodRecord | None) -> Any:
     """What two runs that differ in their encoder files alone have in common."""
+    if isinstance(policy_kwargs, str) and record is not None and record.encoder is not None:
+        return policy_kwargs.replace(record.encoder, "...")
     if not isinstance(policy_kwargs, dict):
         return policy_kwargs
     kwargs = {**policy_kwargs}

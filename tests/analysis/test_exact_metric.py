@@ -136,7 +136,7 @@ def test_error_stays_below_the_tolerance() -> None:
 
 @pytest.mark.parametrize("c", [0.5, 0.9, 0.99])
 def test_enough_steps_where_the_error_shrinks_by_no_more_than_c(c: float) -> None:
-    # Two states that swap, held against one that stays: d_0 = (1 - c) + c d_1 and d_1 = c d_0.
+    # Two states that swap, compared with one that stays: d_0 = (1 - c) + c d_1 and d_1 = c d_0.
     base = np.array([[1.0], [0.0]])
     metric = action_bisim_metric(base, np.array([[1], [0]]), np.array([[0]]), c=c, tol=1e-9)
     np.testing.assert_allclose(metric, [[1 / (1 + c)], [c / (1 + c)]], atol=1e-9, rtol=0)

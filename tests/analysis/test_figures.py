@@ -1,15 +1,19 @@
-"""Every figure's command writes its picture and its numbers."""
+"""Every command of a figure writes an image and numbers."""
 
+import dataclasses
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from zoo_inputs import write_encoder
 
 from sb3_abisim.analysis import command as analyze
 from sb3_abisim.analysis import nav2d_exact, pixels, probes, sweep
+from sb3_abisim.analysis.curves import curves
 from sb3_abisim.analysis.figures import FIGURES, default_encoders
 from sb3_abisim.analysis.sweep import sweep_encoders
 from sb3_abisim.common.paths import resource_path
@@ -37,7 +41,7 @@ def check(folder, stem):
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure(name, tmp_path, capsys):
     # Where it is quickest.
-    env_id = FIGURES[name].usual_ids[-1 if name in ("curves", "leak", "probes") else 0]
+    env_id = FIGURES[name].env_ids[-1 if name in ("curves", "leak", "probes") else 0]
     size = ["-n", str(SIZES[name])] if name in SIZES else []
     analyze.main([name, "--env", env_id, "--images", str(tmp_path), "--trained", str(tmp_path), *size])
     results = check(tmp_path, f"{name}-{env_id}")
@@ -107,7 +111,10 @@ def test_sweep_pretrains_what_is_missing_once(tmp_path):
     [
         (["perturbation", "PointMaze-v0/ssi"], "observation"),
         (["perturbation", "-n", "0"], "at least 1, got 0"),
-        (["near-far", "--env", "PointMaze-v0"], "invalid choice"),
+        (["near-far", "--env", "PointMaze-v0"], "in Nav2D alone, got 'PointMaze-v0'"),
+        (["pixels", "--env", "Nav2D-v0"], "in the point mazes alone, got 'Nav2D-v0'"),
+        (["probes", "--env", "Nav3D-v0", "Nav2D-v0/ssi"], "unknown environment 'Nav3D-v0'"),
+        (["violins"], "invalid choice: 'violins'"),
         (["sweep", "-c", "0.1"], "give --data DIR"),
         (["curves", "no/such"], "no/such"),
     ],
@@ -137,19 +144,65 @@ def test_own_folder_joins_the_shipped_ones(tmp_path):
 
 def test_all_makes_the_usual_ones(monkeypatch, tmp_path):
     made = []
-    monkeypatch.setattr(analyze, "figure", lambda args: made.append((args.command, args.env, args.n)))
+    monkeypatch.setattr(analyze, "make_figure", lambda name, files, env_id, n, *rest: made.append((name, env_id, n)))
     monkeypatch.setattr(analyze, "make_sweep", lambda values, *rest: made.append(("sweep", tuple(values), rest[3])))
+    monkeypatch.setattr(analyze, "load_all", lambda names, env_id: {})
+    figures = {name: dataclasses.replace(one) for name, one in FIGURES.items() if name != "probes"}
+    monkeypatch.setattr(analyze, "FIGURES", figures)
     analyze.main(["all", "--images", str(tmp_path)])
     assert made[0] == ("sweep", (0.25, 0.75, 0.85, 0.99), analyze.SWEEP_LAYOUTS)
-    assert made[1:] == [(name, env_id, one.size) for name, one in FIGURES.items() for env_id in one.usual_ids]
+    assert made[1:] == [(name, env_id, one.size) for name, one in figures.items() for env_id in one.env_ids]
 
 
 @pytest.mark.parametrize("content", ["{", "{}", "[]"])
 def test_a_damaged_card_is_named(tmp_path, content):
-    from types import SimpleNamespace
-
-    from sb3_abisim.analysis.curves import curves
-
     (tmp_path / "mine.json").write_text(content)
-    with pytest.raises(ValueError, match=r"the card .*mine\.json is damaged"):
+    with pytest.raises(ValueError, match=r"the model card .*mine\.json is damaged"):
         curves({"mine": SimpleNamespace(path=tmp_path / "mine.safetensors")})
+
+
+def test_main_curves_are_those_of_the_methods():
+    names = {"abisim": "eval/metric_loss", "ssi": "eval/accuracy", "beta_vae": "eval/reconstruction"}
+    found = curves({name: load_encoder(f"Nav2D-v0/{name}") for name in names})["encoders"]
+    assert {name: one["term"] for name, one in found.items()} == names
+    # Cards were written under earlier names.
+    assert not any("test/" in term for one in found.values() for term in one["curves"])
+
+
+def test_a_method_that_is_not_registered_shows_its_loss(tmp_path):
+    card = json.loads(resolve_encoder("Nav2D-v0/ssi").with_suffix(".json").read_text())
+    (tmp_path / "mine.json").write_text(json.dumps(card))
+    file = SimpleNamespace(path=tmp_path / "mine.safetensors", hash="0", metadata={"objective": "theirs"})
+    assert curves({"mine": file})["encoders"]["mine"]["term"] == "train/loss"
+    card["curves"] = {"n_updates": [1]}
+    (tmp_path / "mine.json").write_text(json.dumps(card))
+    with pytest.raises(ValueError, match=r"mine\.json holds none of the curves train/loss"):
+        curves({"mine": file})
+
+
+def test_every_help_has_an_example(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        analyze.main(["--help"])
+    listed = capsys.readouterr().out
+    assert stopped.value.code == 0 and all(f"    {name} " in listed for name in analyze.COMMANDS)
+    for name in analyze.COMMANDS:
+        with pytest.raises(SystemExit):
+            analyze.main([name, "--help"])
+        assert f"example: sb3-abisim analyze {name} " in capsys.readouterr().out
+
+
+def test_an_environment_of_another_package(tmp_path, monkeypatch, capsys):
+    """Registered by --packages, with a namespace, without factors."""
+    module = "import gymnasium, index_env\n"
+    module += "gymnasium.register('mine/Plain-v0', entry_point=index_env.PlainEnv, max_episode_steps=6)\n"
+    (tmp_path / "my_package.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(gym.registry, "mine/Plain-v0", None)
+    del gym.registry["mine/Plain-v0"]
+    words = ["--env", "mine/Plain-v0", "--packages", "my_package", "--images", str(tmp_path)]
+    analyze.main(["leak", "-n", "40", *words])
+    assert check(tmp_path, "leak-mine-Plain-v0")["audits"]["with a display of the action"]["leaks"]
+    for name in ("neighbors", "probes", "curves"):
+        with pytest.raises(SystemExit):
+            analyze.main([name, *words])
+        assert "no encoder ships for mine/Plain-v0; name the files to look at" in capsys.readouterr().err

@@ -1,11 +1,14 @@
 """Perturbation figures on encoders whose answers are known."""
 
+import copy
+
+import gymnasium as gym
 import numpy as np
 import pytest
 from analysis_inputs import Masked, file_of, identity
 
 from sb3_abisim.analysis import nav2d_exact, perturbation
-from sb3_abisim.analysis.nav2d_exact import GOAL_CELL, held_out_layouts
+from sb3_abisim.analysis.nav2d_exact import GOAL_CELL, eval_layouts
 from sb3_abisim.analysis.perturbation import FAR, NEAR, nav2d_maps, near_and_far, structure_maps, sweep_maps
 from sb3_abisim.envs.nav2d import LAYOUTS, SIZE
 
@@ -37,7 +40,7 @@ def test_a_block_is_four_cells_and_an_agent_two(few_cells):
 
 def test_blocks_lie_in_their_region():
     generator = np.random.default_rng(0)
-    for obstacles in held_out_layouts("Nav2D-v0", 5):
+    for obstacles in eval_layouts("Nav2D-v0", 5):
         agent = int(generator.choice(np.flatnonzero(~obstacles)))
         ay, ax = divmod(agent, SIZE)
         for near in (True, False):
@@ -65,12 +68,22 @@ def test_encoder_that_sees_the_reachable_part_alone(few_cells):
     np.testing.assert_allclose(far[~np.isnan(far)], 0, atol=1e-4)
 
 
-def test_structures_need_a_structure():
-    with pytest.raises(ValueError, match="Nav2D-v0"):
-        structure_maps({}, "Nav2D-v0", 1)
+@pytest.mark.parametrize(
+    ("env_id", "message"), [("Nav2D-v0", "Nav2D-v0 has no fixed structure"), ("PointMaze-v0", "Nav2D alone")]
+)
+def test_structures_need_a_structure(env_id, message):
+    with pytest.raises(ValueError, match=message):
+        structure_maps({}, env_id, 1)
 
 
-def test_sweep_holds_each_c_against_its_own_metric(few_cells):
+def test_a_structure_is_that_of_the_environment_whatever_its_id(monkeypatch):
+    spec = copy.copy(gym.spec("Nav2DMaze-v0"))
+    spec.id = "MyGrid-v0"
+    monkeypatch.setitem(gym.registry, spec.id, spec)
+    assert structure_maps({}, spec.id, 1)["structure"] == list(LAYOUTS["maze"])
+
+
+def test_sweep_compares_each_c_with_its_metric(few_cells):
     # At c = 0 the metric is the base distance, which is what the base itself shows.
     base = identity(SHAPE)
     results = sweep_maps({0.0: base, 0.5: base}, base.encoder, "Nav2D-v0", 1)["encoders"]

@@ -5,8 +5,8 @@ import pytest
 from analysis_inputs import identity
 
 from sb3_abisim.analysis import pixels
-from sb3_abisim.analysis.pixels import BINS, clip_settings, pixel_maps
-from sb3_abisim.analysis.scenes import sample_episodes
+from sb3_abisim.analysis.pixels import BINS, pixel_maps
+from sb3_abisim.analysis.scenes import eval_settings, sample_episodes
 
 SHAPE = (3, 64, 64)
 
@@ -43,7 +43,7 @@ def test_offset_map_sorts_by_rows_and_columns():
 
 def test_pixels_as_embedding_feel_every_obstacle_alike():
     (result,) = pixel_maps({"identity": identity(SHAPE)}, "PointMaze-v0", 40)["encoders"].values()
-    one = result["settings"]["held-out layouts"]
+    one = result["settings"]["eval layouts"]
     assert one["clip"] is None and len(one["profile"]) == len(BINS)
     # Two strips of 8 x 4 pixels, unless they lie on others; hardly any of the disc's three dozen pixels' change.
     assert one["profile"][-1] == pytest.approx(one["profile"][-2], rel=0.2)
@@ -52,7 +52,7 @@ def test_pixels_as_embedding_feel_every_obstacle_alike():
 
 def test_a_new_clip_changes_most_pixels():
     (result,) = pixel_maps({"identity": identity(SHAPE)}, "DistractorPointMaze-v0", 12)["encoders"].values()
-    assert list(result["settings"]) == list(clip_settings("DistractorPointMaze-v0"))
+    assert list(result["settings"]) == list(eval_settings("DistractorPointMaze-v0"))
     for one in result["settings"].values():
         assert one["clip"] > 0.3 > one["agent"]
 

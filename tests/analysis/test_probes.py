@@ -1,5 +1,6 @@
 """Probes on targets that are known to be readable, or not."""
 
+import index_env  # noqa: F401  (registers the environments)
 import numpy as np
 import pytest
 import torch as th
@@ -7,18 +8,16 @@ from analysis_inputs import Masked, file_of, identity
 from torch import nn
 
 from sb3_abisim.analysis import probes as module
-from sb3_abisim.analysis.pixels import clip_settings
 from sb3_abisim.analysis.probes import (
     Target,
     by_objective,
     invariance_ratio,
-    mean_interval,
     probes,
     read,
     table,
     targets,
 )
-from sb3_abisim.analysis.scenes import sample_episodes
+from sb3_abisim.analysis.scenes import eval_settings, sample_episodes
 from sb3_abisim.envs.point_maze import top_down
 
 SHAPE = (3, 64, 64)
@@ -59,14 +58,14 @@ def test_targets_are_those_that_vary():
 
 
 def test_targets_in_a_scan():
-    """The position in the picture and the heading, both of the state before the step; episodes do not end at once."""
-    samples = sample_episodes("ScanNav-v0", 3, 10, env_kwargs=clip_settings("ScanNav-v0")["other episodes"])
+    """The position in the observation and the heading, both before the step; episodes do not end at once."""
+    samples = sample_episodes("ScanNav-v0", 3, 10, env_kwargs=eval_settings("ScanNav-v0")["eval episodes"])
     assert len(samples) == 30
     found = targets(samples)
     assert set(found) == {"agent", "obstacles", "heading"}
     east, north = found["agent"].values.T * 128 / 6
     ahead = found["heading"].values
-    for k, frame in enumerate(samples.frames.astype(int)):
+    for k, frame in enumerate(samples.obs.astype(int)):
         # The nose is the only magenta thing.
         rows, columns = np.nonzero((frame[0] > 200) & (frame[1] < 60) & (frame[2] > 150))
         # 0.17 m ahead of the agent; a heading of 0 is up and of 90 is left.
@@ -74,12 +73,19 @@ def test_targets_in_a_scan():
         assert np.abs(nose - 0.17 * 128 / 6 * np.array([-ahead[k, 1], ahead[k, 0]])).max() < 1.0
 
 
-def test_interval_by_hand():
-    mean, half = mean_interval([1.0, 2.0, 3.0])
+def test_mean_over_seeds():
+    def encoder(seed, score, ratio):
+        scores = {"eval": {"agent": dict.fromkeys(module.PROBES, score)}}
+        return {"objective": "ssi", "seed": seed, "scores": scores, "invariance": {"eval": ratio}}
+
+    three = {str(seed): encoder(seed, float(seed), None) for seed in (1, 2, 3)}
+    group = by_objective(three)["ssi"]
+    mean, half = group["scores"]["eval"]["agent"]["linear"]
     # Student's t with two degrees of freedom: 4.303 standard errors.
     assert mean == 2.0 and half == pytest.approx(4.302653 / np.sqrt(3))
-    assert mean_interval([0.5]) == (0.5, None)
-    assert mean_interval([None, None]) is None
+    assert group["n_seeds"] == 3 and group["invariance"]["eval"] is None
+    single = by_objective({"one": encoder(0, 0.5, 0.25)})["ssi"]
+    assert single["scores"]["eval"]["agent"]["MLP"] == (0.5, None) and single["invariance"]["eval"] == (0.25, None)
 
 
 def test_invariance_by_what_an_encoder_sees():
@@ -88,7 +94,7 @@ def test_invariance_by_what_an_encoder_sees():
     class Obstacles(nn.Module):
         def forward(self, observations):
             color = th.tensor(top_down.OBSTACLE)[:, None, None] / 255
-            return ((((observations + 1) / 2) - color).abs().amax(dim=1) < 1e-3).float().flatten(1)
+            return ((observations - color).abs().amax(dim=1) < 1e-3).float().flatten(1)
 
     blind = invariance_ratio(file_of(Obstacles(), SHAPE).encoder, samples)
     raw = invariance_ratio(identity(SHAPE).encoder, samples)
@@ -102,7 +108,7 @@ def test_shift_of_a_clip_that_is_all_an_encoder_sees():
     shifts = module.clip_shifts(encoder, samples, [samples])
     shown = np.unique(samples.factors["clip"])
     assert len(shifts) == len(shown)
-    pixels = samples.frames.reshape(len(samples), -1) / 255.0
+    pixels = samples.obs.reshape(len(samples), -1) / 255.0
     center = pixels.mean(axis=0)
     unit = np.abs(pixels - center).sum(axis=1).mean()
     first = np.abs(pixels[samples.factors["clip"] == shown[0]].mean(axis=0) - center).sum() / unit
@@ -119,10 +125,10 @@ def test_table_over_seeds(monkeypatch):
     files["seed 1"].encoder.scale *= 3
     results = probes(files, "Nav2D-v0", 60)
     group = results["groups"]["ssi"]
-    mean, half = group["scores"]["held-out layouts"]["agent"]["linear"]
+    mean, half = group["scores"]["eval layouts"]["agent"]["linear"]
     # Position is linear in the agent's channel, and both encoders hold the same of it.
     assert group["n_seeds"] == 2 and mean > 0.7 and half == pytest.approx(0, abs=1e-4)
-    assert group["scores"]["held-out layouts"]["obstacles"]["linear"][0] < 0.75
+    assert group["scores"]["eval layouts"]["obstacles"]["linear"][0] < 0.75
     assert "| ssi | 2 |" in table(results) and "untrained" in table(results) and "invariance" not in table(results)
 
 
@@ -132,3 +138,22 @@ def test_two_encoders_of_one_seed_are_refused():
     files = {name: file_of(Masked(np.ones((3, 15, 15))), (3, 15, 15)) for name in "ab"}
     with pytest.raises(ValueError, match="same seed"):
         probes(files, "Nav2D-v0", 1)
+
+
+def test_factors_of_any_environment_are_read(monkeypatch):
+    monkeypatch.setattr(module, "PROBES", ("linear",))
+    samples = sample_episodes("IndexEnv-v0", 200, 4)
+    found = targets(samples)
+    assert {name: (target.kind, target.values.shape[1]) for name, target in found.items()} == {
+        "step": ("continuous", 1), "pair": ("continuous", 2), "even": ("binary", 1),
+    }  # fmt: skip
+    np.testing.assert_array_equal(found["even"].values[:, 0], samples.factors["step"] % 2 == 0)
+    # The step is the first channel's number.
+    features = samples.obs.reshape(len(samples), -1).astype(float)
+    first, second = (Target(found["step"].values[half], "continuous") for half in (slice(400), slice(400, None)))
+    assert read("linear", features[:400], first, features[400:], second) > 0.999
+
+
+def test_without_factors_there_is_nothing_to_read():
+    with pytest.raises(ValueError, match=r"probes read an environment's factors\(\), and this one has none"):
+        targets(sample_episodes("PlainEnv-v0", 2, 2))

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_abisim.benchmark.command import main
+from sb3_abisim.benchmark.command import COMMANDS, main
+from sb3_abisim.benchmark.graph import build
 from sb3_abisim.benchmark.jobs.source_hash import source_hash
-from sb3_abisim.benchmark.plan import Plan, build
+from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.common.files import file_hash
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,7 +28,7 @@ SMALL = [
 ]  # fmt: skip
 
 
-def test_dry_run_lists_the_cells_and_does_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_dry_run_lists_the_jobs_and_does_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["-o", str(tmp_path / "new"), *SMALL, "--dry-run"])
     out = capsys.readouterr().out
     assert [line.split()[1].split("-")[0] for line in out.splitlines()[::2]] == ["data", "encoder", "run", "final"]
@@ -55,7 +56,7 @@ def test_mistakes_end_with_2(
     assert not list(tmp_path.glob("**/logs")), "nothing was started"
 
 
-def test_cells_of_other_code_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_jobs_of_other_code_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = Plan(methods=("vanilla",), env_ids=("Nav2D-v0",), seeds=(0, 1), final_episodes=0)
     for job, source in zip(build(plan), (source_hash("run"), "other"), strict=True):
         model = tmp_path / job.output / job.output_file
@@ -104,7 +105,7 @@ def test_the_whole_graph_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.slow
-def test_a_kill_costs_the_cell_in_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_kill_costs_the_job_in_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = [sys.executable, "-m", "sb3_abisim", "benchmark", "-o", str(tmp_path), *SMALL]
     driver = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(ROOT)})
     deadline = time.monotonic() + 300
@@ -133,3 +134,27 @@ def test_a_kill_costs_the_cell_in_flight(tmp_path: Path, capsys: pytest.CaptureF
     assert all((repeated[name] == final[name]).all() for name in final), "every evaluation is the same"
     main(["report", str(tmp_path), "--reference", "ssi"])
     assert (tmp_path / "report" / "index.html").is_file()
+
+
+def test_an_environment_of_another_package(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each job imports the package; the report shows the splits that its traits name."""
+    words = ["--env", "SplitToy-v0", "--packages", "toy_env", "--methods", "vanilla", "--seeds", "0", "--device", "cpu",
+             "--jobs", "1", "-n", "64", "--eval-freq", "32", "--eval-episodes", "2", "--n-eval-envs", "2",
+             "--final-episodes", "3", "--params", "n_steps:32", "batch_size:16", "n_epochs:1"]  # fmt: skip
+    main(["-o", str(tmp_path), *words])
+    assert "2 of 2 jobs done, 0 of them before; 0 failed" in capsys.readouterr().err
+    with open(tmp_path / "report" / "final.csv", newline="") as file:
+        found = [(row["mode"], row["split"]) for row in csv.DictReader(file)]
+    assert sorted(found) == [(mode, split) for mode in ("deterministic", "stochastic") for split in ("eval", "train")]
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert '<th class="n">eval</th><th class="n">train</th>' in page
+    assert "lowest and highest mean return of these runs" in page
+
+
+def test_every_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in COMMANDS:
+        words = ["--help"] if name == "run" else [name, "--help"]
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        out = capsys.readouterr().out
+        assert stopped.value.code == 0 and f"example: sb3-abisim {' '.join(['benchmark', *words[:-1]])} " in out

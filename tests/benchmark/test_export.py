@@ -52,16 +52,16 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
             for kind, inputs in (("run", ["encoder-0"]), ("final", [f"run-{method}{seed}"])):
                 manifest = {"name": f"{kind}-{method}{seed}", "output": output, "inputs": inputs, "host": "my-machine",
                           "command": ["-o", f"{root.resolve()}/x", "/opt/venv/bin/python"], "seconds": 3.5}  # fmt: skip
-                write_marker(root, manifest)
-    write_marker(root, {"name": "encoder-0", "output": "encoders/e.safetensors", "inputs": ["data-0"]})
-    write_marker(root, {"name": "data-0", "output": "data/d", "inputs": []})
-    write_marker(root, {"name": "data-1", "output": "data/other", "inputs": []})
+                write_manifest(root, manifest)
+    write_manifest(root, {"name": "encoder-0", "output": "encoders/e.safetensors", "inputs": ["data-0"]})
+    write_manifest(root, {"name": "data-0", "output": "data/d", "inputs": []})
+    write_manifest(root, {"name": "data-1", "output": "data/other", "inputs": []})
     index = {"plan": {"methods": ["abisim=/home/me/e.safetensors", "vanilla"]}, "runs": entries}
     (root / "benchmark.json").write_text(json.dumps(index))
     return root
 
 
-def write_marker(root: Path, manifest: dict[str, object]) -> None:
+def write_manifest(root: Path, manifest: dict[str, object]) -> None:
     (root / "jobs").mkdir(exist_ok=True)
     (root / "jobs" / f"{manifest['name']}.json").write_text(json.dumps(manifest))
 

@@ -15,8 +15,10 @@ from benchmark_inputs import write_run
 from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from sb3_abisim.benchmark import command as command
-from sb3_abisim.benchmark.jobs.job import JobError
-from sb3_abisim.benchmark.plan import Job, Plan, build
+from sb3_abisim.benchmark.graph import build
+from sb3_abisim.benchmark.jobs.job import Job
+from sb3_abisim.benchmark.jobs.launch import JobError
+from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.benchmark.sweep import best_of, parse_space, sweep
 from sb3_abisim.common.files import file_hash
 
@@ -75,12 +77,12 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_space() -> None:
-    words = ["objective_kwargs.c=0.5..0.99", "learning_rate=1e-4..1e-3:log", "objective_kwargs.pairs=random|near",
+    words = ["objective_kwargs.c=0.5..0.99", "learning_rate=1e-4..1e-3:log", "objective_kwargs.pairs=random|nearest",
              "ssi.batch_size=64..512", "n_updates=1..9:log"]  # fmt: skip
     assert parse_space(words, "abisim") == {
         "abisim.objective_kwargs.c": FloatDistribution(0.5, 0.99),
         "abisim.learning_rate": FloatDistribution(1e-4, 1e-3, log=True),
-        "abisim.objective_kwargs.pairs": CategoricalDistribution(["random", "near"]),
+        "abisim.objective_kwargs.pairs": CategoricalDistribution(["random", "nearest"]),
         "ssi.batch_size": IntDistribution(64, 512),
         "abisim.n_updates": IntDistribution(1, 9, log=True),
     }
@@ -154,7 +156,7 @@ def test_an_interrupted_sweep_goes_on_as_if_it_had_not_been(batch: int, tmp_path
 
 def test_equal_trials_are_found_again(tmp_path: Path) -> None:
     engine = FakeEngine()
-    trials = sweep(tmp_path, PLAN, ["objective_kwargs.pairs=random|near"], 6, lambda: engine, batch=3)
+    trials = sweep(tmp_path, PLAN, ["objective_kwargs.pairs=random|nearest"], 6, lambda: engine, batch=3)
     assert len({trial.words for trial in trials}) == 2
     kinds = [job.kind for job in engine.ran]
     # One base per seed; per kind of pairs and seed an encoder and a run.
@@ -190,8 +192,8 @@ def test_a_trial_that_fails_is_no_end(
         (["--space", "eval_fraction=0.5..1.5"], "eval_fraction must lie in .* got 1.5"),
         (["--space", "objective_kwargs.gamma=1..2"], r"abisim has no objective_kwargs\.gamma"),
         (["--space", "no_setting=1..2"], "unknown pretraining setting no_setting"),
-        (["--space", *SPACE, "--method", "vanilla"], "a sweep pretrains one of ssi, .* got 'vanilla'"),
-        (["--space", *SPACE, "--method", "abisim=FILE"], "a sweep pretrains one of ssi, .* got 'abisim=FILE'"),
+        (["--space", *SPACE, "--method", "vanilla"], "no objective pretrains 'vanilla', only abisim, "),
+        (["--space", *SPACE, "--method", "abisim=FILE"], "encoder for each trial; give abisim without =FILE"),
         (["--space", *SPACE, "--batch", "0"], "batch must be at least 1, got 0"),
         (["--space", *SPACE, "--jobs", "0"], "n_jobs must be at least 1, got 0"),
     ],

@@ -18,12 +18,12 @@ def base():
 
 @pytest.fixture(scope="module")
 def layouts():
-    return nav.held_out_layouts("Nav2D-v0", 8, exact_teacher.FIRST_LAYOUT)
+    return nav.eval_layouts("Nav2D-v0", 8, exact_teacher.FIRST_LAYOUT)
 
 
-def cells(frames):
-    """Obstacles and agents of pictures."""
-    flat = frames.reshape(len(frames), 3, -1)
+def cells(observations):
+    """Obstacles and agents of observations."""
+    flat = observations.reshape(len(observations), 3, -1)
     return flat[0, nav.CHANNELS.index("obstacles")] > 0, flat[:, nav.CHANNELS.index("agent")].argmax(axis=1)
 
 

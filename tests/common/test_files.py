@@ -108,7 +108,7 @@ def test_remove_temporaries_spares_other_files(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == [".draft.tmp", ".lock", "file", "notes.tmp"]
 
 
-def test_file_digest_is_sha256(tmp_path: Path) -> None:
+def test_file_hash_is_sha256(tmp_path: Path) -> None:
     (tmp_path / "abc").write_bytes(b"abc")  # the example of FIPS 180-2
     assert file_hash(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 

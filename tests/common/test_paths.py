@@ -1,65 +1,18 @@
-"""Where the name of an encoder leads: a path, a shipped file, the Hub."""
+"""Where files lie that come with the package, and those that it keeps."""
 
-import sys
-import types
 from pathlib import Path
 
 import pytest
 
-from sb3_abisim.common import paths as resources
+from sb3_abisim.common import paths
 from sb3_abisim.common.paths import cache_folder, resource_path
-from sb3_abisim.networks import encoder_file as checkpoint
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, resolve_encoder
-
-
-def test_resolve_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shipped, here = tmp_path / "shipped", tmp_path / "here"
-    for folder in (shipped / "Nav2D-v0", here):
-        folder.mkdir(parents=True)
-    monkeypatch.setattr(checkpoint, "resource_path", lambda kind: {"encoders": shipped}[kind])
-    monkeypatch.chdir(here)
-    (shipped / "Nav2D-v0" / "ssi.safetensors").touch()
-    assert resolve_encoder("Nav2D-v0/ssi") == shipped / "Nav2D-v0" / "ssi.safetensors"
-    with pytest.raises(EncoderNotFoundError) as raised:
-        resolve_encoder("Nav2D-v0/abisim")
-    for part in (here / "Nav2D-v0/abisim", shipped / "Nav2D-v0/abisim.safetensors", "Shipped encoders: Nav2D-v0/ssi."):
-        assert str(part) in str(raised.value)
-    (here / "Nav2D-v0").mkdir()
-    (here / "Nav2D-v0" / "ssi").touch()
-    assert resolve_encoder("Nav2D-v0/ssi") == here / "Nav2D-v0" / "ssi"
-    with pytest.raises(ValueError, match="''"):
-        resolve_encoder("")
-
-
-def test_hub_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-
-    def hf_hub_download(repo_id: str, filename: str, revision: str | None) -> str:
-        calls.append((repo_id, filename, revision))
-        if filename == "absent":
-            raise OSError("404 entry not found")
-        return str(tmp_path / filename)
-
-    hub = types.SimpleNamespace(hf_hub_download=hf_hub_download)
-    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
-    assert resolve_encoder("hf://me/repo/a/b.safetensors") == tmp_path / "a/b.safetensors"
-    assert resolve_encoder("hf://me/repo@v1/b") == tmp_path / "b"
-    with pytest.raises(EncoderNotFoundError, match=r"hf://me/repo/absent.*404"):
-        resolve_encoder("hf://me/repo/absent")
-    assert calls == [("me/repo", "a/b.safetensors", None), ("me/repo", "b", "v1"), ("me/repo", "absent", None)]
-    for name in ("hf://", "hf://me/repo", "hf:///x/y"):
-        with pytest.raises(ValueError, match="looks like"):
-            resolve_encoder(name)
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(EncoderNotFoundError, match="pip install huggingface_hub"):
-        resolve_encoder("hf://me/repo/b")
 
 
 def test_resource_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert resource_path("encoders") == Path(resources.__file__).resolve().parents[1] / "encoders"
+    assert resource_path("encoders") == Path(paths.__file__).resolve().parents[2] / "encoders"
     package = tmp_path / "site" / "sb3_abisim"
     (package / "hyperparams").mkdir(parents=True)
-    monkeypatch.setattr(resources, "_PACKAGE", package)
+    monkeypatch.setattr(paths, "_PACKAGE", package)
     assert resource_path("hyperparams") == package / "hyperparams"
     assert resource_path("encoders") == tmp_path / "site" / "encoders"
     with pytest.raises(ValueError, match="'models'"):

@@ -1,5 +1,6 @@
+"""Collecting: what is written, stopped and gone on with at any moment, and refused."""
+
 import errno
-import hashlib
 import json
 import os
 import signal
@@ -11,7 +12,9 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from dataset_inputs import tree
 
+from sb3_abisim.common import vocabulary
 from sb3_abisim.common.files import folder_lock
 from sb3_abisim.data import collect as collect_module
 from sb3_abisim.data import writer as dataset_writer
@@ -22,15 +25,9 @@ from sb3_abisim.data.format import CONFIG_NAME, CUT, META_NAME, TERMINATED, TRUN
 N_ENVS = 4
 # 12 steps of 4 copies: two time limits.
 PER_SHARD = 48
-COMMAND = [sys.executable, "-m", "sb3_abisim", "collect", "--gym-packages", "index_env", "--n-envs", str(N_ENVS)]
+COMMAND = [sys.executable, "-m", "sb3_abisim", "collect", "--packages", "index_env", "--n-envs", str(N_ENVS)]
 KILL_EVERYWHERE = str(Path(__file__).parents[1] / "kill_everywhere.py")
 CHILD_ENV = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
-
-
-def tree(folder: str | Path) -> dict[str, str]:
-    """Every file of a folder, with its hash."""
-    paths = [Path(top) / name for top, _, names in os.walk(folder) for name in names]
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
 @pytest.fixture(autouse=True)
@@ -140,7 +137,7 @@ def stop(*args: object) -> None:
 def test_finished_dataset_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--env", "IndexEnv-v0", "-n", "110", "-o", str(tmp_path / "d"), "--n-envs", "4"]
     main(arguments)
-    assert "complete (digest" in capsys.readouterr().out
+    assert "complete (hash" in capsys.readouterr().out
     before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "d").iterdir()}
     main(arguments)
     assert "already complete, nothing to do" in capsys.readouterr().out
@@ -174,6 +171,21 @@ def test_other_arguments_are_refused_with_both_sides(tmp_path: Path) -> None:
         collect_index(tmp_path / "d", seed=5)
     collect_index(tmp_path / "d")
     assert tree(tmp_path / "d") == before
+
+
+def test_a_dataset_with_the_names_of_another_version_is_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    collect_index(tmp_path / "d", 50, offset=7)
+    monkeypatch.setitem(vocabulary._ENV_KWARGS, "shift", "offset")
+    config = json.loads((tmp_path / "d" / CONFIG_NAME).read_bytes())
+    (tmp_path / "d" / CONFIG_NAME).write_text(json.dumps(config | {"env_kwargs": {"shift": 7}}))
+    collect_index(tmp_path / "d", offset=7)
+    dataset = TransitionDataset(tmp_path / "d")
+    assert dataset.n_transitions == 110 and dataset.meta["env_kwargs"] == {"shift": 7}
+    assert dataset.env_kwargs == {"offset": 7}
+    with pytest.raises(ValueError, match=r"env_kwargs: {'offset': 7} in the folder, {'offset': 8} now"):
+        collect_index(tmp_path / "d", offset=8)
 
 
 def test_shards_of_other_package_versions_are_not_mixed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -317,12 +329,6 @@ def test_arguments_reach_the_environment_and_the_manifest(tmp_path: Path) -> Non
     assert json.loads((tmp_path / "d" / CONFIG_NAME).read_bytes())["policy"] == "uniform"
 
 
-def test_env_kwargs_values_are_literals_or_strings() -> None:
-    pairs = ["a:true", "b:True", "c:1.5", "d:C:/x", "e:[1, 2]", "f:None", "g:__import__('os')"]
-    expected = {"a": True, "b": True, "c": 1.5, "d": "C:/x", "e": [1, 2], "f": None, "g": "__import__('os')"}
-    assert collect_module._parse_env_kwargs(pairs) == expected
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -330,15 +336,15 @@ def test_env_kwargs_values_are_literals_or_strings() -> None:
         ({"-n": "0"}, "n_transitions must be at least 1, got 0"),
         ({"--n-envs": "0"}, "n_envs must be at least 1, got 0"),
         ({"--seed": "-1"}, "seed must be at least 0, got -1"),
-        ({"--env-kwargs": "offset=3"}, "key:value"),
+        ({"--env-kwargs": "offset=3"}, "--env-kwargs takes NAME:VALUE"),
         ({"--env-kwargs": "nonsense:3"}, "cannot make IndexEnv-v0 with {'nonsense': 3}"),
-        ({"--gym-packages": "no_such_module"}, "cannot import 'no_such_module'"),
+        ({"--packages": "no_such_module"}, "cannot import 'no_such_module'"),
         ({"--env": "PlainEnv-v0", "--env-kwargs": "channels_last:true"}, "channels first"),
         ({"--env": "CartPole-v1"}, "uint8 images"),
         ({"--env-kwargs": "offset:{1,2}"}, "env_kwargs must be what JSON can hold"),
         (
-            {"--env": "DistractorPointMaze-v0", "--env-kwargs": "color_jitter:no"},
-            "color_jitter must be True or False, got 'no'",
+            {"--env": "DistractorPointMaze-v0", "--env-kwargs": "color_jitter:maybe"},
+            "color_jitter must be True or False, got 'maybe'",
         ),
     ],
 )
@@ -350,7 +356,7 @@ def test_mistakes_exit_2_with_one_line(
         main([part for pair in arguments.items() for part in pair])
     assert exit_info.value.code == 2
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
+    assert len(lines) == 1 and lines[0].startswith("sb3-abisim collect: error: ")
     assert message in lines[0]
     assert not (tmp_path / "d").exists()
 

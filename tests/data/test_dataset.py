@@ -1,3 +1,5 @@
+"""Reading: which transitions there are, in which order, and from which frames."""
+
 import functools
 import json
 import pickle
@@ -86,11 +88,11 @@ def test_valid_starts_are_those_found_by_walking(dataset: TransitionDataset, k: 
 def test_pairs_never_cross_an_episode(dataset: TransitionDataset, k: int) -> None:
     pairs = 0
     for batch in dataset.batches(7, k=k):
-        now, later = labels(batch.obs), labels(batch.next_obs)
-        assert (later[:, 0] == now[:, 0] + k).all()
-        assert (later[:, 1] == now[:, 1]).all()
+        obs, next_obs = labels(batch.obs), labels(batch.next_obs)
+        assert (next_obs[:, 0] == obs[:, 0] + k).all()
+        assert (next_obs[:, 1] == obs[:, 1]).all()
         if k == 1:
-            assert (later[:, 2] == batch.actions).all()
+            assert (next_obs[:, 2] == batch.actions).all()
         assert batch.actions.dtype == np.int64
         assert batch.obs.dtype == np.uint8
         pairs += len(batch.actions)
@@ -102,13 +104,13 @@ def test_pairs_of_a_range_of_steps_are_all_of_them_once(dataset: TransitionDatas
     expected = [(t, k) for k in (2, 3, 4) for t in range(dataset.n_frames - k) if not ends[t : t + k].any()]
     starts, steps = dataset.pairs((2, 4))
     assert list(zip(starts.tolist(), steps.tolist(), strict=True)) == expected
-    parts = [dataset.pairs([2, 4], part) for part in ("train", "test")]
-    assert sorted(zip(*np.concatenate(parts, axis=1).tolist(), strict=True)) == sorted(expected)
+    splits = [dataset.pairs([2, 4], split) for split in ("train", "eval")]
+    assert sorted(zip(*np.concatenate(splits, axis=1).tolist(), strict=True)) == sorted(expected)
     visited = []
     for batch in dataset.batches(1, k=(2, 4)):
-        (now,), (later,) = labels(batch.obs), labels(batch.next_obs)
-        assert now[1] == later[1]
-        visited.append((int(now[0]), int(now[1]), int(later[0] - now[0])))
+        (obs,), (next_obs,) = labels(batch.obs), labels(batch.next_obs)
+        assert obs[1] == next_obs[1]
+        visited.append((int(obs[0]), int(obs[1]), int(next_obs[0] - obs[0])))
     seen = labels(dataset.frames(starts))
     assert sorted(visited) == sorted((*pair, k) for pair, k in zip(seen[:, :2].tolist(), steps.tolist(), strict=True))
 
@@ -130,7 +132,7 @@ def test_sequences_hold_every_action_in_between(dataset: TransitionDataset) -> N
     n_batches = 0
     for batch in dataset.batches(5, k=3, sequences=True):
         assert batch.actions.shape == (5, 3)
-        # The last action is the one that led to the later picture.
+        # The last action is the one that led to the later observation.
         assert (labels(batch.next_obs)[:, 2] == batch.actions[:, 2]).all()
         n_batches += 1
     assert n_batches == len(dataset.valid_starts(3)) // 5
@@ -200,7 +202,7 @@ def test_a_pass_visits_every_transition_once(dataset: TransitionDataset) -> None
 
 
 @pytest.mark.parametrize(("k", "most_frames"), [(1, 25), (3, 32), ((2, 4), 25)])
-def test_runs_visit_every_pair_once_and_share_its_frames(dataset: TransitionDataset, k: Any, most_frames: int) -> None:
+def test_chunks_hold_every_pair_once_and_share_its_frames(dataset: TransitionDataset, k: Any, most_frames: int) -> None:
     starts, _ = dataset.pairs(k)
     whole = list(dataset.batches(len(starts), k=k, chunk_length=4))
     plain = list(dataset.batches(len(starts), k=k))
@@ -216,22 +218,38 @@ def as_transitions(batch: dataset_module.TransitionBatch) -> list[tuple[int, ...
     return [tuple(row) for row in both.tolist()]
 
 
-def test_runs_follow_an_episode_and_end_with_it(dataset: TransitionDataset) -> None:
-    """Of the frames of a run of three, the index that is painted into each counts up by one."""
+def test_chunks_follow_an_episode(dataset: TransitionDataset) -> None:
+    """Of the frames of a chunk of three, the index that is painted into each counts up by one."""
     lengths, seen = [], set()
     for epoch in range(4):
         (batch,) = dataset.batches(N, epoch=epoch, chunk_length=3)
-        now, later = labels(batch.obs), labels(batch.next_obs)
-        assert (later[:, 1] == now[:, 1]).all() and (later[:, 0] == now[:, 0] + 1).all()
-        joined = (now[1:, :2] == later[:-1, :2]).all(axis=1)
+        obs, next_obs = labels(batch.obs), labels(batch.next_obs)
+        assert (next_obs[:, 1] == obs[:, 1]).all() and (next_obs[:, 0] == obs[:, 0] + 1).all()
+        joined = (obs[1:, :2] == next_obs[:-1, :2]).all(axis=1)
         first = np.flatnonzero(np.r_[True, ~joined])
         lengths.append(np.diff(np.r_[first, N]))
-        seen |= {tuple(row) for row in now[first, :2].tolist()}
-    # Two runs of an episode that meet by chance count as one here.
+        seen |= {tuple(row) for row in obs[first, :2].tolist()}
+    # Two chunks of an episode that meet by chance count as one here.
     assert np.mean([(length <= 3).mean() for length in lengths]) > 0.9
     assert np.mean(np.concatenate(lengths)) > 2
-    # Where runs begin differs from pass to pass.
+    # Where chunks begin differs from pass to pass.
     assert len(seen) > 1.3 * len(lengths[0])
+
+
+@pytest.mark.parametrize("chunk_length", [3, 50])
+def test_chunks_end_with_their_episode(
+    dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch, chunk_length: int
+) -> None:
+    """The first transition of an episode follows the last of the episode before it by chance only."""
+    monkeypatch.setattr(dataset, "_frames", lambda index: index)  # frames are then their indices
+    starts = dataset.valid_starts()
+    (batch,) = dataset.batches(len(starts), chunk_length=chunk_length)
+    last = dataset.ends[batch.obs[:-1] + 1] != INSIDE
+    n_crossed = np.count_nonzero(last & (batch.obs[1:] == batch.obs[:-1] + 2))
+    n_joined = np.count_nonzero(batch.obs[1:] == batch.obs[:-1] + 1)
+    n_segments = np.count_nonzero(dataset.ends)
+    assert n_joined > n_segments, "most transitions are joined to others of their episode"
+    assert n_crossed < 0.1 * n_segments
 
 
 def test_batch_larger_than_the_data_is_refused(dataset: TransitionDataset) -> None:
@@ -264,16 +282,16 @@ def test_more_shards_than_a_process_may_have_open(dataset: TransitionDataset, mo
         assert len(dataset.meta["shards"]) > len(few._maps) == 3
 
 
-def test_parts_share_no_segment(folder: Path) -> None:
+def test_splits_share_no_segment(folder: Path) -> None:
     dataset = TransitionDataset(folder, eval_fraction=0.2)
     segment = np.cumsum(np.concatenate([[0], dataset.ends[:-1] != INSIDE]))
-    train, test = dataset.valid_starts(split="train"), dataset.valid_starts(split="eval")
-    assert not set(segment[train]) & set(segment[test])
-    assert sorted([*train, *test]) == dataset.valid_starts().tolist()
-    assert len(set(segment[test])) == round(0.2 * (segment[-1] + 1))
-    assert dataset.valid_starts(split="eval").tolist() == test.tolist()
-    with pytest.raises(ValueError, match="part must be"):
-        dataset.valid_starts(part="valid")  # type: ignore[arg-type]
+    train, unseen = dataset.valid_starts(split="train"), dataset.valid_starts(split="eval")
+    assert not set(segment[train]) & set(segment[unseen])
+    assert sorted([*train, *unseen]) == dataset.valid_starts().tolist()
+    assert len(set(segment[unseen])) == round(0.2 * (segment[-1] + 1))
+    assert dataset.valid_starts(split="eval").tolist() == unseen.tolist()
+    with pytest.raises(ValueError, match="split must be 'train', 'eval' or None, got 'test'"):
+        dataset.valid_starts(split="test")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="eval_fraction 0"):
         TransitionDataset(folder, eval_fraction=0).valid_starts(split="eval")
 
@@ -285,7 +303,7 @@ def test_pickle_holds_no_data(dataset: TransitionDataset) -> None:
     assert (again.frames(np.arange(50)) == dataset.frames(np.arange(50))).all()
 
 
-def test_reading_does_not_load_the_pictures(tmp_path: Path) -> None:
+def test_reading_does_not_load_the_frames(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     length, n_segments, shape = 100, 40, (3, 64, 64)
     identity = {
@@ -332,7 +350,7 @@ def test_spaces_survive_json() -> None:
         space_to_json(gym.spaces.MultiBinary(3))
 
 
-def test_only_our_own_files_are_ever_cleaned_up() -> None:
+def test_only_files_of_the_format_are_ever_cleaned_up() -> None:
     ours = ["frames-00000.npy", "factor_agent-00012.npy", "shard-00003.json", "ends-123456.npy"]
     others = ["frames.npy", "notes-00000.npy", "meta.json", "factor_-00001.npy", "shard-00003.json.bak"]
     assert [is_shard_file(name) for name in ours + others] == [True] * len(ours) + [False] * len(others)

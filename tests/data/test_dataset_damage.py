@@ -7,15 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_inputs import collect_index
+from dataset_inputs import collect_index, rewrite_meta, without_hashes
 
 import sb3_abisim.data.dataset as dataset_module
 from sb3_abisim.data.dataset import TransitionDataset
-from sb3_abisim.data.format import (
-    META_NAME,
-    DatasetError,
-    make_meta,
-)
+from sb3_abisim.data.format import HASH_KEY, META_NAME, DatasetError, make_meta
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +52,7 @@ def test_truncated_and_missing_files_are_named(copy: Path) -> None:
     content = path.read_bytes()
     path.write_bytes(content[:-1])
     with pytest.raises(
-        DatasetError, match=rf"actions-00001.npy has {len(content) - 1} bytes.*sb3_abisim.data.collect --env"
+        DatasetError, match=rf"actions-00001.npy has {len(content) - 1} bytes.*sb3-abisim collect --env"
     ):
         TransitionDataset(copy, verify=False)
     path.unlink()
@@ -78,7 +74,7 @@ def test_large_datasets_are_hashed_on_request_only(copy: Path, monkeypatch: pyte
 def test_a_process_hashes_a_file_once_unless_it_changed(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hashed = []
     real = dataset_module.file_hash
-    monkeypatch.setattr(dataset_module, "file_digest", lambda path: hashed.append(path) or real(path))
+    monkeypatch.setattr(dataset_module, "file_hash", lambda path: hashed.append(path) or real(path))
     TransitionDataset(copy)
     assert len(hashed) == 9 * 6
     TransitionDataset(copy)
@@ -96,7 +92,7 @@ def test_a_pickle_in_place_of_an_array_is_not_run(copy: Path, tmp_path: Path) ->
     meta = json.loads((copy / META_NAME).read_bytes())
     np.save(copy / "actions-00000.npy", np.array([Payload()], dtype=object), allow_pickle=True)
     rewrite_meta(copy, meta)
-    with pytest.raises(DatasetError, match=r"actions-00000\.npy is not an array file of ours"):
+    with pytest.raises(DatasetError, match=r"actions-00000\.npy is not an array file of a dataset"):
         TransitionDataset(copy)
     assert not (tmp_path / "executed").exists()
 
@@ -109,17 +105,8 @@ def test_a_forged_manifest_does_not_lead_out_of_the_folder(copy: Path) -> None:
         TransitionDataset(copy)
 
 
-def rewrite_meta(folder: Path, meta: dict) -> None:
-    """Make a forger's meta.json: all sums are right."""
-    for shard in meta["shards"]:
-        for name, entry in shard["files"].items():
-            entry |= {"bytes": (folder / name).stat().st_size, "sha256": dataset_module.file_hash(folder / name)}
-    config = {k: v for k, v in meta.items() if k not in ("n_transitions", "n_frames", "shards", "digest", "checksum")}
-    (folder / META_NAME).write_text(json.dumps(make_meta(config, meta["shards"])))
-
-
 def test_what_is_not_a_finished_dataset_is_refused_with_the_remedy(copy: Path, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"nothing is not a folder.*sb3_abisim\.collect"):
+    with pytest.raises(DatasetError, match=r"nothing is not a folder.*sb3-abisim collect"):
         TransitionDataset(tmp_path / "nothing")
     (tmp_path / "other").mkdir()
     with pytest.raises(DatasetError, match="other is not a dataset"):
@@ -133,11 +120,10 @@ def test_what_is_not_a_finished_dataset_is_refused_with_the_remedy(copy: Path, t
         TransitionDataset(copy)
 
 
-def test_digest_depends_on_data_and_arguments_but_not_on_versions(copy: Path) -> None:
+def test_hash_depends_on_data_and_arguments_but_not_on_versions(copy: Path) -> None:
     meta = json.loads((copy / META_NAME).read_bytes())
-    config = {k: v for k, v in meta.items() if k not in ("n_transitions", "n_frames", "shards", "digest", "checksum")}
-    shards = meta["shards"]
-    assert make_meta(config, shards)["digest"] == meta["digest"]
-    assert make_meta(config | {"versions": {"numpy": "0"}}, shards)["digest"] == meta["digest"]
-    assert make_meta(config | {"seed": 4}, shards)["digest"] != meta["digest"]
-    assert make_meta(config, shards[::-1])["digest"] != meta["digest"]
+    config, shards = without_hashes(meta), meta["shards"]
+    assert make_meta(config, shards)[HASH_KEY] == meta[HASH_KEY]
+    assert make_meta(config | {"versions": {"numpy": "0"}}, shards)[HASH_KEY] == meta[HASH_KEY]
+    assert make_meta(config | {"seed": 4}, shards)[HASH_KEY] != meta[HASH_KEY]
+    assert make_meta(config, shards[::-1])[HASH_KEY] != meta[HASH_KEY]

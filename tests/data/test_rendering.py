@@ -1,4 +1,4 @@
-"""Datasets without frames: what is drawn from the factors is what was seen, or it is refused."""
+"""Datasets without frames: what is rendered from the factors is what was seen, or it is refused."""
 
 import json
 import shutil
@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dataset_inputs import rewrite_meta, tree
 from scan_inputs import empty_room
-from test_collect import tree
-from test_dataset_damage import rewrite_meta
 
 from sb3_abisim.common import files as atomic
 from sb3_abisim.data import collect as collect_module
@@ -52,7 +51,7 @@ def test_frames_are_those_seen_at_collection(folder: Path, scene: Path, monkeypa
     dataset = TransitionDataset(folder)
     assert dataset.meta["format_version"] == 2 and len(dataset.meta["shards"]) == 4
     assert not list(folder.glob("frames-*")) and (np.bincount(dataset.ends, minlength=4) > 0).all()
-    monkeypatch.setattr(ScanNavVectorEnv, "draws_factors", False)
+    monkeypatch.setattr(ScanNavVectorEnv, "renders_factors", False)
     env = make_vector_env("ScanNav-v0", 4, {**SMALL, "scenes": str(scene)})
     seen = []
     for k, shard in enumerate(dataset.meta["shards"]):
@@ -62,18 +61,18 @@ def test_frames_are_those_seen_at_collection(folder: Path, scene: Path, monkeypa
     everything = np.arange(dataset.n_frames)
     assert np.array_equal(dataset.frames(everything), np.array(seen))
     batch = next(dataset.batches(64))
-    # A picture may come twice (left and right again), a transition is known by both and its action.
+    # A frame may come twice (left and right again), a transition is known by both and its action.
     known = {(seen[t].tobytes(), int(dataset.actions([t])[0]), seen[t + 1].tobytes()) for t in dataset.valid_starts()}
-    for now, action, later in zip(batch.obs, batch.actions, batch.next_obs, strict=True):
-        assert (now.tobytes(), int(action), later.tobytes()) in known
+    for obs, action, next_obs in zip(batch.obs, batch.actions, batch.next_obs, strict=True):
+        assert (obs.tobytes(), int(action), next_obs.tobytes()) in known
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"obs_mode": "rgb", "marker": "box", "image_size": 64, "view_size": 5.0}])
-def test_frames_of_the_flats_are_those_seen(kwargs: dict) -> None:
+def test_frames_of_the_apartments_are_those_seen(kwargs: dict) -> None:
     env, other = (ScanNavVectorEnv(8, goals_per_scene=2, **kwargs) for _ in range(2))
     frames, _ = env.reset(seed=0)
     for _ in range(30):
-        assert np.array_equal(other.draw(env.factors()), frames)
+        assert np.array_equal(other.render_factors(env.factors()), frames)
         frames, *_ = env.step(env.action_space.sample())
 
 
@@ -150,8 +149,8 @@ def test_damaged_factors_are_refused(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"env_id": "CartPole-v1"}, "'CartPole-v1', which would draw them, is not one of ours"),
-        ({"env_id": "Nav2D-v0", "env_kwargs": {}}, "Nav2D-v0 does not draw any"),
+        ({"env_id": "CartPole-v1"}, "'CartPole-v1', which would render them, is not registered here or is no BatchEnv"),
+        ({"env_id": "Nav2D-v0", "env_kwargs": {}}, "Nav2D-v0 does not render any"),
         ({"env_kwargs": {"num_envs": 3}}, "cannot be made: .*multiple values"),
         ({"env_kwargs": {"entry_point": "os:system"}}, "cannot be made: .*unexpected keyword"),
         ({"env_kwargs": {"scenes": "/etc/passwd"}}, "cannot be made: .*suffix"),
@@ -186,4 +185,4 @@ def test_factors_of_another_setting_are_refused(name: str, value: float, message
         factors["agent"] += value
     factors[name] = np.full_like(factors[name], value) + (factors["goal"] if name == "goal" else 0)
     with pytest.raises(ValueError, match=message):
-        env.batch.draw(factors)
+        env.batch.render_factors(factors)

@@ -22,7 +22,7 @@ def make_batch(env_id, num_envs, **kwargs):
 def test_check_env(env_id):
     env = gym.make(env_id, render_mode="rgb_array")
     with warnings.catch_warnings():
-        # A 15 x 15 grid is too small for NatureCNN, which is why it has an encoder of its own.
+        # A 15 x 15 grid is too small for NatureCNN, which is why it has another encoder.
         warnings.filterwarnings("ignore", message="The minimal resolution for an image is 36x36")
         sb3_check_env(env)
     gymnasium_check_env(env.unwrapped, skip_close_check=True)
@@ -63,8 +63,8 @@ def test_seed_determines_everything(env_id):
     def rollout(seed):
         env = make_batch(env_id, 2)
         env.action_space.seed(1)
-        frames = [env.reset(seed=seed)[0]]
-        return np.stack(frames + [env.step(env.action_space.sample())[0] for _ in range(10)])
+        first = env.reset(seed=seed)[0]
+        return np.stack([first] + [env.step(env.action_space.sample())[0] for _ in range(10)])
 
     assert np.array_equal(rollout(3), rollout(3))
     assert not np.array_equal(rollout(3), rollout(4))
@@ -140,7 +140,7 @@ def test_final_info_holds_the_factors_of_the_last_observation():
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_np_random_is_the_environments(env_id):
-    """As in Gymnasium's own: its seed is the one in use, and a generator that is put there is used."""
+    """As in the environments of Gymnasium: its seed is the one in use, and a generator that is put there is used."""
     env = gym.make(env_id).unwrapped
     first = env.reset()[0].copy()
     again = gym.make(env_id).unwrapped

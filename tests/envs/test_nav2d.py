@@ -9,10 +9,10 @@ from sb3_abisim.envs.nav2d import GOAL, LAYOUTS, MOVES, Nav2DEnv, Nav2DVectorEnv
 IDS = ["Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0"]
 
 
-def cells(picture):
+def cells(observation):
     """Agent (x, y), obstacle set, goal (x, y) of an observation."""
-    (agent,), (goal,) = ([(int(x), int(y)) for y, x in np.argwhere(picture[c])] for c in (0, 2))
-    return agent, {(int(x), int(y)) for y, x in np.argwhere(picture[1])}, goal
+    (agent,), (goal,) = ([(int(x), int(y)) for y, x in np.argwhere(observation[c])] for c in (0, 2))
+    return agent, {(int(x), int(y)) for y, x in np.argwhere(observation[1])}, goal
 
 
 def reachable(start, obstacles):
@@ -85,7 +85,7 @@ def test_fixed_structures(layout):
         assert reachable(agent, obstacles) == {cell for cell, c in structure.items() if c == "."}
         assert {cell for cell, c in structure.items() if c == "#"} <= obstacles
         shown.append(frozenset(obstacles))
-    assert len(set(shown)) > 15, "the obstacles that cannot be reached are drawn anew"
+    assert len(set(shown)) > 15, "the obstacles that cannot be reached are sampled in each episode"
 
 
 @pytest.mark.parametrize("env_id", IDS)

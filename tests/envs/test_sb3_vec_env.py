@@ -1,4 +1,4 @@
-"""A batch behind ``DummyVecEnv``: nothing differs but the speed."""
+"""The batched VecEnv against ``DummyVecEnv``: nothing differs but the speed."""
 
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,14 @@ def make(env_id: str, cls: Any, n_envs: int = 3, **kwargs: Any) -> Any:
 
 
 def same(ours: Any, theirs: Any) -> bool:
-    """Equal infos, pictures included; clocks are not compared."""
+    """Equal infos, observations included; clocks are not compared."""
     if isinstance(theirs, dict):
         return ours.keys() == theirs.keys() and all(same(ours[key], theirs[key]) for key in theirs if key != "t")
     return type(ours) is type(theirs) and np.array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("env_id", ["ScanNav-v0", "DistractorPointMaze-v0"])
-def test_fingerprints_are_passed_on(env_id: str) -> None:
+def test_content_hashes_are_passed_on(env_id: str) -> None:
     ours, theirs = (make(env_id, cls, n_envs=2) for cls in (BatchedVecEnv, DummyVecEnv))
     assert (
         ours.get_attr("content_hash") == theirs.get_attr("content_hash") and len(ours.get_attr("content_hash")[0]) == 64
@@ -73,7 +73,7 @@ def test_equals_dummy(env_id: str, tmp_path: Path) -> None:
 
 
 def test_reset_options_of_one_copy_leave_the_others_alone() -> None:
-    """ScanNav's goals: each copy walks to its own, and knows its own way."""
+    """ScanNav's goals: each copy walks to another, and knows its way."""
     ours, theirs = (make("ScanNav-v0", cls, n_envs=2) for cls in (BatchedVecEnv, DummyVecEnv))
     theirs.reset()
     goals = [factors["goal"].tolist() for factors in theirs.env_method("factors")]
@@ -91,7 +91,7 @@ def test_reset_options_of_one_copy_leave_the_others_alone() -> None:
 
 
 def test_the_generator_is_that_of_each_copy() -> None:
-    """As with ``DummyVecEnv``: what draws from a copy's ``np_random`` moves its episodes."""
+    """As with ``DummyVecEnv``: what samples from a copy's ``np_random`` moves its episodes."""
     ours, theirs = (make("Nav2D-v0", cls, n_envs=2) for cls in (BatchedVecEnv, DummyVecEnv))
     for env in (ours, theirs):
         env.seed(5)
@@ -100,7 +100,7 @@ def test_the_generator_is_that_of_each_copy() -> None:
     assert np.array_equal(ours.reset(), theirs.reset())
 
 
-def test_arguments_and_pictures_reach_the_batch() -> None:
+def test_arguments_and_observations_reach_the_batch() -> None:
     kwargs = {"env_kwargs": {"layout": "corridor", "render_mode": "rgb_array"}}
     ours, theirs = (make("Nav2D-v0", cls, **kwargs) for cls in (BatchedVecEnv, DummyVecEnv))
     assert np.array_equal(ours.reset(), theirs.reset())

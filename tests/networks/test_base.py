@@ -1,4 +1,4 @@
-"""The encoders have the sizes that the paper gives, see -1..1, and are rebuilt from their specs."""
+"""Encoders: the paper's sizes, rebuilt from their specs, and networks that somebody else registers."""
 
 import copy
 
@@ -8,7 +8,11 @@ import pytest
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_abisim.networks.base import ENCODERS, make_encoder
+from sb3_abisim import registry
+from sb3_abisim.networks.base import make_encoder, preprocess, set_memory_format
+from sb3_abisim.registry import register_network
+
+BUILT_IN = {name: network for name, network in registry.networks().items() if network.observation_shape}
 
 
 def image_space(*shape):
@@ -37,9 +41,9 @@ def test_sizes_that_nav2d_cannot_have(features_dim):
         make_encoder(image_space(3, 15, 15), features_dim=features_dim)
 
 
-@pytest.mark.parametrize("name", ENCODERS)
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_spec_rebuilds_the_network(name):
-    shape = ENCODERS[name].observation_shape
+    shape = BUILT_IN[name].observation_shape
     encoder = make_encoder(image_space(*shape), name)
     spec = encoder.spec()
     again = make_encoder(image_space(*shape), spec["name"], **spec["kwargs"])
@@ -53,10 +57,10 @@ def is_channels_last(module):
     return bool(weights) and all(w.is_contiguous(memory_format=th.channels_last) for w in weights)
 
 
-@pytest.mark.parametrize("name", ENCODERS)
+@pytest.mark.parametrize("name", BUILT_IN)
 def test_weights_lie_channels_last(name):
     """However they got there: built, initialized as SB3 does, copied, or read from another layout."""
-    encoder = make_encoder(image_space(*ENCODERS[name].observation_shape), name)
+    encoder = make_encoder(image_space(*BUILT_IN[name].observation_shape), name)
     holder = th.nn.Sequential(encoder)
     holder.apply(ActorCriticPolicy.init_weights)
     assert is_channels_last(encoder) and is_channels_last(copy.deepcopy(encoder))
@@ -89,11 +93,12 @@ def test_inputs_are_mapped_to_plus_minus_one():
 @pytest.mark.parametrize(
     ("shape", "name", "kwargs", "message"),
     [
-        ((3, 20, 20), None, {}, "no default encoder"),
+        ((3, 20, 20), None, {}, "no default network"),
         ((3, 64, 64), "ResNet", {}, "ResNet"),
         ((3, 64, 64), "PointMazeEncoder", {"width": 3}, "width"),
         ((3, 15, 15), "PointMazeEncoder", {}, "shape"),
         ((4, 64, 64), "PointMazeEncoder", {}, "shape"),
+        ((8,), "PointMazeEncoder", {}, "observations must be images"),
     ],
     ids=str,
 )
@@ -135,3 +140,106 @@ def test_weights_are_float32_whatever_the_default_is():
     finally:
         th.set_default_dtype(th.float32)
     assert {parameter.dtype for parameter in encoder.parameters()} == {th.float32}
+
+
+class Pooled(th.nn.Module):
+    """A network as a user writes it: no base class, a layer that differs in training, and 5-d weights."""
+
+    def __init__(self, n_channels: int, width: int) -> None:
+        super().__init__()
+        self.conv = th.nn.Conv2d(n_channels, width, 3)
+        self.norm = th.nn.BatchNorm2d(width)
+        self.deep = th.nn.Conv3d(1, 2, (width, 1, 1))
+
+    def forward(self, observations):
+        features = self.norm(self.conv(observations)).relu()
+        return self.deep(features[:, None]).flatten(1)
+
+
+def pooled(observation_space, width=4):
+    return Pooled(observation_space.shape[0], width)
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Registers networks for one test."""
+    registry.networks()
+    monkeypatch.setattr(registry._NETWORKS, "by_name", dict(registry._NETWORKS.by_name))
+    return register_network
+
+
+def test_a_registered_factory_may_give_any_module(registered):
+    registered("pooled", pooled)
+    th.manual_seed(0)
+    encoder = make_encoder(image_space(2, 7, 5), "pooled", width=3)
+    # Two maps of 5 x 3, found by a forward pass that leaves no trace.
+    assert encoder.features_dim == 30 and encoder(th.rand(3, 2, 7, 5)).shape == (3, 30)
+    th.manual_seed(0)
+    module = pooled(image_space(2, 7, 5), width=3)
+    after = make_encoder(image_space(2, 7, 5), "pooled", width=3).layers
+    assert after.training and int(after.norm.num_batches_tracked) == 0 and float(after.norm.running_mean.sum()) == 0
+    assert [p.shape for p in after.parameters()] == [p.shape for p in module.parameters()]
+    assert encoder.spec() == {"name": "pooled", "kwargs": {"width": 3}}
+    x = th.rand(3, 2, 7, 5)
+    assert th.equal(encoder.eval()(x), encoder.layers(x)), "nothing comes before it or after"
+    assert is_channels_last(encoder)
+
+
+def test_looking_for_the_size_takes_no_random_numbers(registered):
+    registered("noisy", lambda space: th.nn.Sequential(th.nn.Flatten(), th.nn.Dropout(), Noise()))
+    th.manual_seed(0)
+    expected = th.rand(3)
+    th.manual_seed(0)
+    assert make_encoder(image_space(1, 2, 2), "noisy").features_dim == 4
+    assert th.equal(th.rand(3), expected)
+
+
+class Noise(th.nn.Module):
+    def forward(self, x):
+        return x + th.randn_like(x)
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (th.nn.Conv2d(2, 3, 3), r"must give a tensor \(batch, features_dim\), got \(1, 3, 5, 3\); end it in Flatten"),
+        (th.nn.Flatten(0), r"got \(70,\)"),
+        (th.nn.AdaptiveMaxPool2d(1, return_indices=True), "must give a tensor .* got tuple"),
+        (th.nn.LSTM(5, 3), r"bad does not take observations of shape \(2, 7, 5\): LSTM"),
+        (th.nn.Conv2d(3, 3, 3), r"bad does not take observations of shape \(2, 7, 5\)"),
+        (th.nn.Linear(9, 3), r"bad does not take observations of shape \(2, 7, 5\)"),
+    ],
+    ids=str,
+)
+def test_a_registered_network_of_the_wrong_shape_is_refused(registered, module, message):
+    registered("bad", lambda space: module)
+    with pytest.raises(ValueError, match=message):
+        make_encoder(image_space(2, 7, 5), "bad")
+
+
+def test_a_registered_network_may_be_the_default_of_a_shape(registered):
+    registered("pooled", pooled, observation_shape=(1, 9, 9))
+    assert make_encoder(image_space(1, 9, 9)).spec() == {"name": "pooled", "kwargs": {}}
+    with pytest.raises(
+        ValueError, match=r"no default network for observations of shape \(1, 9, 8\); .*pooled \(1, 9, 9\)"
+    ):
+        make_encoder(image_space(1, 9, 8))
+    with pytest.raises(ValueError, match=r"pooled does not take these arguments: .*depth"):
+        make_encoder(image_space(1, 9, 9), depth=3)
+
+
+def test_preprocessing_is_that_of_sb3():
+    images = np.random.default_rng(0).integers(256, size=(4, 3, 7, 5), dtype=np.uint8)
+    x = preprocess(images, image_space(3, 7, 5))
+    assert x.dtype == th.float32 and th.equal(x, th.as_tensor(images).float() / 255)
+    laid_out = th.as_tensor(images).contiguous(memory_format=th.channels_last)
+    assert preprocess(laid_out, image_space(3, 7, 5)).is_contiguous(memory_format=th.channels_last)
+
+
+def test_the_memory_format_changes_no_weight():
+    module = Pooled(2, 3)
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    for memory_format in (th.channels_last, th.contiguous_format):
+        set_memory_format(module, memory_format)
+        assert module.conv.weight.is_contiguous(memory_format=memory_format)
+        assert all(th.equal(value, before[name]) for name, value in module.state_dict().items())

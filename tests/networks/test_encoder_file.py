@@ -3,6 +3,7 @@
 import hashlib
 import json
 import pickle
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,14 +15,15 @@ import safetensors.torch
 import torch as th
 from gymnasium import spaces
 
-from sb3_abisim.networks import encoder_file as checkpoint
+from sb3_abisim import registry
+from sb3_abisim.common.cli import import_packages
 from sb3_abisim.networks.base import Encoder, make_encoder
-from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
+from sb3_abisim.networks.encoder_file import REFERENCE_TOLERANCE, EncoderFileError, load_encoder, save_encoder
 
 SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
 ACTIONS = spaces.Box(np.array([-1, -2], np.float32), np.array([3, 4], np.float32))
 FRAMES = np.random.default_rng(0).integers(0, 256, (5, 3, 15, 15), np.uint8)
-DATASET_DIGEST = "0" * 64
+DATASET_HASH = "0" * 64
 
 
 def seeded_encoder(seed: int = 0) -> Encoder:
@@ -37,8 +39,8 @@ def save(path: Path, encoder: Encoder | None = None, **changes: Any) -> str:
         "env_kwargs": {"n_obstacles": 3},
         "objective": "ssi",
         "settings": {"beta": 0.5, "digest": "0" * 64},
-        "dataset_digest": DATASET_DIGEST,
-        "golden_observations": FRAMES,
+        "dataset_hash": DATASET_HASH,
+        "reference_observations": FRAMES,
     }
     return save_encoder(path, encoder or seeded_encoder(), **(arguments | changes))
 
@@ -49,25 +51,25 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "encoder.safetensors"
 
 
-def write_with_digest(path: Path, tensors: dict[str, th.Tensor], document: Any) -> None:
-    """An encoder file with a right digest, made without the code under test: search for a marker and replace it."""
-    marker = bytes(range(200, 232))
-    tensors["digest"] = th.tensor(list(marker), dtype=th.uint8)
+def write_with_hash(path: Path, tensors: dict[str, th.Tensor], document: Any) -> None:
+    """An encoder file with a right hash, made without the code under test: search for a placeholder and replace it."""
+    placeholder = bytes(range(200, 232))
+    tensors["digest"] = th.tensor(list(placeholder), dtype=th.uint8)
     data = safetensors.torch.save(
         tensors, {"sb3_abisim": document if isinstance(document, str) else json.dumps(document)}
     )
-    assert data.count(marker) == 1
-    hash = hashlib.sha256(data.replace(marker, bytes(32))).digest()
-    path.write_bytes(data.replace(marker, hash))
+    assert data.count(placeholder) == 1
+    hash = hashlib.sha256(data.replace(placeholder, bytes(32))).digest()
+    path.write_bytes(data.replace(placeholder, hash))
 
 
 def forge(path: Path, edit: Callable[[dict[str, th.Tensor], dict[str, Any]], object]) -> None:
-    """Change tensors and metadata of an encoder file, and set the digest right."""
+    """Change tensors and metadata of an encoder file, and set the hash right."""
     data = path.read_bytes()
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     tensors, document = safetensors.torch.load(data), json.loads(header["__metadata__"]["sb3_abisim"])
     edit(tensors, document)
-    write_with_digest(path, tensors, document)
+    write_with_hash(path, tensors, document)
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -94,11 +96,11 @@ def test_round_trip(tmp_path: Path) -> None:
         "env_kwargs": {"n_obstacles": 3},
         "objective": "ssi",
         "settings": {"beta": 0.5, "digest": "0" * 64},
-        "dataset_digest": DATASET_DIGEST,
+        "dataset_hash": DATASET_HASH,
     }
 
 
-def test_golden_batch_is_what_the_network_makes_of_images_over_255(path: Path) -> None:
+def test_reference_batch_is_what_the_network_makes_of_images_over_255(path: Path) -> None:
     tensors = safetensors.torch.load_file(path)
     assert np.array_equal(tensors["golden.observations"].numpy(), FRAMES)
     with th.no_grad():
@@ -106,11 +108,27 @@ def test_golden_batch_is_what_the_network_makes_of_images_over_255(path: Path) -
     assert th.allclose(tensors["golden.embeddings"], expected, rtol=0, atol=1e-6)
 
 
-def test_digest_is_sha256_with_its_own_bytes_blank(path: Path) -> None:
+def test_hash_is_sha256_with_its_bytes_blank(path: Path) -> None:
     hash = load_encoder(path).hash
     data = path.read_bytes()
     assert data.count(bytes.fromhex(hash)) == 1
     assert hashlib.sha256(data.replace(bytes.fromhex(hash), bytes(32))).hexdigest() == hash
+
+
+def test_names_from_before_they_were_changed_are_read_as_todays(tmp_path: Path) -> None:
+    old = {
+        "holdout": 0.05,
+        "dataset_digest": "0" * 64,
+        "objective_kwargs": {"pairs": "near", "expectation": "behaviour"},
+    }
+    save(tmp_path / "e", settings=old, env_kwargs={"recolour": False})
+    metadata = load_encoder(tmp_path / "e").metadata
+    assert metadata["settings"] == {
+        "eval_fraction": 0.05,
+        "dataset_hash": "0" * 64,
+        "objective_kwargs": {"pairs": "nearest", "expectation": "behavior"},
+    }
+    assert metadata["env_kwargs"] == {"color_jitter": False}
 
 
 def test_same_arguments_same_bytes(tmp_path: Path) -> None:
@@ -140,7 +158,7 @@ def test_no_flipped_bit_loads(path: Path) -> None:
         path.write_bytes(bad)
         with pytest.raises(EncoderFileError) as raised:
             load_encoder(path)
-        assert str(path) in str(raised.value) and "sb3_abisim.pretraining.pretrain" in str(raised.value)
+        assert str(path) in str(raised.value) and "sb3-abisim pretrain" in str(raised.value)
     path.write_bytes(good)
     load_encoder(path)
 
@@ -207,9 +225,6 @@ def test_a_forged_but_harmless_file_loads(path: Path) -> None:
 @pytest.mark.parametrize(
     "network",
     [
-        {"name": "system", "kwargs": {}},
-        {"name": "os.system", "kwargs": {"command": "true"}},
-        {"name": "__class__", "kwargs": {}},
         {"name": None, "kwargs": {}},
         {"name": ["Nav2DEncoder"], "kwargs": {}},
         {"name": "Nav2DEncoder", "kwargs": {"unknown": 1}},
@@ -230,6 +245,66 @@ def test_network_from_the_file_is_validated(path: Path, network: Any) -> None:
         load_encoder(path)
 
 
+@pytest.mark.parametrize(
+    ("name", "kwargs"),
+    [("system", {}), ("os.system", {"command": "true"}), ("os:system", {"command": "true"}), ("__class__", {})],
+)
+def test_a_network_that_is_not_registered_is_refused(path: Path, name: str, kwargs: dict[str, Any]) -> None:
+    forge(path, lambda tensors, document: document.update(network={"name": name, "kwargs": kwargs}))
+    with pytest.raises(
+        EncoderFileError, match=rf"network '{name}', which is not registered; .*Nav2DEncoder.*--packages"
+    ):
+        load_encoder(path)
+
+
+@pytest.fixture
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A module of somebody else that registers a network; imported, it leaves a file."""
+    name = "encoder_file_plugin"
+    (tmp_path / f"{name}.py").write_text(
+        "from pathlib import Path\n"
+        "import torch\n"
+        "from torch import nn\n"
+        "from sb3_abisim import register_network\n"
+        "Path(__file__).with_name('imported').touch()\n"
+        "def factory(space, width=2):\n"
+        "    width = torch.tensor(width).item()  # which a tensor without memory has not\n"
+        "    return nn.Sequential(nn.Conv2d(space.shape[0], width, 3), nn.BatchNorm2d(width), nn.Flatten())\n"
+        f"register_network('{name}.net', factory)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    registry.networks()
+    monkeypatch.setattr(registry._NETWORKS, "by_name", dict(registry._NETWORKS.by_name))
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    return name
+
+
+def test_a_network_of_somebody_else_comes_back_once_its_package_is_imported(
+    plugin: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import_packages([plugin])
+    th.manual_seed(0)
+    encoder = make_encoder(SPACE, f"{plugin}.net", width=3)
+    encoder(th.rand(8, 3, 15, 15))  # moves the statistics of its batch norm
+    save(tmp_path / "e", encoder)
+    again = load_encoder(tmp_path / "e").encoder
+    assert again.spec() == encoder.spec() == {"name": f"{plugin}.net", "kwargs": {"width": 3}}
+    x = th.rand(2, 3, 15, 15)
+    assert th.equal(again(x), encoder.eval()(x))
+    key = "encoder.layers.0.bias"
+    save(tmp_path / "f", encoder)
+    forge(tmp_path / "f", lambda tensors, document: tensors.update({key: tensors[key].double()}))
+    with pytest.raises(EncoderFileError, match="do not fit the network"):
+        load_encoder(tmp_path / "f")
+    # As in another process, that has not imported the package: refused, and nothing of it is run.
+    registry._NETWORKS.by_name.pop(f"{plugin}.net")
+    monkeypatch.delitem(sys.modules, plugin)
+    (tmp_path / "imported").unlink()
+    with pytest.raises(EncoderFileError, match=r"encoder_file_plugin\.net.* is not registered.*--packages"):
+        load_encoder(tmp_path / "e")
+    assert plugin not in sys.modules and not (tmp_path / "imported").exists()
+
+
 def test_vast_network_is_refused_before_memory_is_taken(path: Path) -> None:
     def edit(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> None:
         document["network"] = {"name": "PointMazeEncoder", "kwargs": {"features_dim": 10**10}}
@@ -245,14 +320,14 @@ def test_vast_network_is_refused_before_memory_is_taken(path: Path) -> None:
     "document", ["[]", "{}", "nonsense", "[" * 100_000, '{"format": 1}', '{"format": 1, "contract": 3}']
 )
 def test_malformed_metadata(path: Path, document: str) -> None:
-    write_with_digest(path, safetensors.torch.load_file(path), document)
+    write_with_hash(path, safetensors.torch.load_file(path), document)
     with pytest.raises(EncoderFileError, match="not a valid encoder file"):
         load_encoder(path)
 
 
-def test_other_format_and_contract(path: Path) -> None:
+def test_other_format_and_metadata(path: Path) -> None:
     forge(path, lambda tensors, document: document["contract"].pop("objective"))
-    with pytest.raises(EncoderFileError, match="contract has the keys"):
+    with pytest.raises(EncoderFileError, match="the metadata have the keys"):
         load_encoder(path)
     forge(path, lambda tensors, document: document.update(format=2))
     with pytest.raises(EncoderFileError, match=r"format 2.*newer"):
@@ -276,7 +351,7 @@ def test_tensors_that_do_not_fit(path: Path, name: str, value: th.Tensor) -> Non
 
 
 def raw_embeddings(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> None:
-    """As if pretraining had not divided pictures by 255."""
+    """As if pretraining had not divided observations by 255."""
     with th.no_grad():
         tensors["golden.embeddings"] = seeded_encoder()(tensors["golden.observations"].float())
 
@@ -291,14 +366,14 @@ def raw_embeddings(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> N
         lambda tensors, document: tensors["golden.observations"].add_(1),
     ],
 )
-def test_golden_batch_that_does_not_agree(path: Path, edit: Callable[..., object]) -> None:
+def test_reference_batch_that_does_not_agree(path: Path, edit: Callable[..., object]) -> None:
     forge(path, edit)
-    with pytest.raises(EncoderFileError, match="golden batch differently"):
+    with pytest.raises(EncoderFileError, match="reference batch differently"):
         load_encoder(path)
 
 
-def test_golden_batch_tolerates_rounding(path: Path) -> None:
-    forge(path, lambda tensors, document: tensors["golden.embeddings"].mul_(1 + checkpoint.REFERENCE_TOLERANCE / 2))
+def test_reference_batch_tolerates_rounding(path: Path) -> None:
+    forge(path, lambda tensors, document: tensors["golden.embeddings"].mul_(1 + REFERENCE_TOLERANCE / 2))
     load_encoder(path)
 
 
@@ -308,9 +383,9 @@ def test_save_refuses(tmp_path: Path) -> None:
         next(broken.parameters())[0] = th.nan
     with pytest.raises(ValueError, match=r"not finite.*layers\.0\.weight"):
         save(tmp_path / "e", broken)
-    with pytest.raises(ValueError, match="golden_observations must be uint8"):
+    with pytest.raises(ValueError, match="reference_observations must be uint8"):
         save(tmp_path / "e", reference_observations=FRAMES / 255)
-    with pytest.raises(ValueError, match="golden_observations must be uint8"):
+    with pytest.raises(ValueError, match="reference_observations must be uint8"):
         save(tmp_path / "e", reference_observations=FRAMES[:0])
     with pytest.raises(ValueError, match="JSON"):
         save(tmp_path / "e", settings={"path": Path("x")})

@@ -14,16 +14,16 @@ from sb3_abisim.objectives.beta_vae import BetaVAE, beta_vae_loss
 
 def test_loss_equals_loop():
     generator = th.Generator().manual_seed(1)
-    logits, pictures = th.randn(2, 3, 2, 2, generator=generator), th.rand(2, 3, 2, 2, generator=generator)
+    logits, images = th.randn(2, 3, 2, 2, generator=generator), th.rand(2, 3, 2, 2, generator=generator)
     mean, log_std = th.randn(2, 5, generator=generator), th.randn(2, 5, generator=generator)
     reconstruction = kl = 0.0
-    for x, p in zip(logits.flatten().tolist(), pictures.flatten().tolist(), strict=True):
+    for x, p in zip(logits.flatten().tolist(), images.flatten().tolist(), strict=True):
         probability = 1 / (1 + math.exp(-x))
         reconstruction -= p * math.log(probability) + (1 - p) * math.log(1 - probability)
     for m, s in zip(mean.flatten().tolist(), log_std.flatten().tolist(), strict=True):
         # KL(N(m, e^2s) || N(0, 1)) = -s + (e^2s + m^2 - 1) / 2
         kl += -s + (math.exp(2 * s) + m * m - 1) / 2
-    loss, terms = beta_vae_loss(logits, pictures, mean, log_std, 0.7)
+    loss, terms = beta_vae_loss(logits, images, mean, log_std, 0.7)
     assert float(terms["reconstruction"]) == pytest.approx(reconstruction / 2, rel=1e-5)
     assert float(terms["kl"]) == pytest.approx(kl / 2, rel=1e-5)
     assert float(loss) == pytest.approx((reconstruction + 0.7 * kl) / 2, rel=1e-5)
@@ -50,19 +50,19 @@ def test_gradients_reach_everything():
     assert all(float(p.grad.abs().sum()) > 0 for p in objective.parameters())
 
 
-def test_reconstructs_unseen_pictures_and_not_under_a_large_penalty():
+def test_reconstructs_unseen_observations_and_not_under_a_large_penalty():
     error = {}
     for kl_weight in (0.0, 100.0):
         th.manual_seed(0)
         objective = fit(BetaVAE(LineEncoder(), DISCRETE, kl_weight=kl_weight), make_batch(DISCRETE, 512), 400)
         error[kl_weight] = float(objective.loss(make_batch(DISCRETE, 512, seed=9))[1]["squared_error"])
-    variance = 1 / 12  # of uniform numbers, the error of a constant picture
+    variance = 1 / 12  # of uniform numbers, the error of a constant image
     assert error[0.0] < 0.2 * variance
     assert error[100.0] > 0.8 * variance, "a posterior equal to the prior says nothing"
 
 
 @th.no_grad()
-def test_an_embedding_of_its_pictures_serves_the_next_observations_not_at_all():
+def test_actions_and_next_observations_do_not_count():
     objective, batch = BetaVAE(LineEncoder(), DISCRETE), make_batch(DISCRETE, 4)
     th.manual_seed(1)
     one = objective.loss(batch)[0]
@@ -72,15 +72,15 @@ def test_an_embedding_of_its_pictures_serves_the_next_observations_not_at_all():
 
 
 @pytest.mark.parametrize("shape", [(3, 15, 15), (3, 64, 64), (4, 128, 96), (1, 5, 9)], ids=str)
-def test_decoder_fits_every_picture(shape):
+def test_decoder_fits_every_size(shape):
     decoder = Decoder(7, shape)
     assert decoder(th.zeros(2, 7)).shape == (2, *shape)
 
 
 def test_decoder_takes_its_shape_from_the_encoder():
     objective = BetaVAE(PointMazeEncoder(n_input_channels=2), DISCRETE)
-    pictures = th.rand(2, 2, 64, 64)
-    objective.loss(TensorBatch.of(pictures, th.zeros(2, dtype=th.int64), pictures))
+    obs = th.rand(2, 2, 64, 64)
+    objective.loss(TensorBatch.of(obs, th.zeros(2, dtype=th.int64), obs))
 
 
 @pytest.mark.parametrize("kl_weight", [-1.0, math.nan, math.inf])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch as th
-from objective_inputs import DISCRETE, LineEncoder, fit, make_batch
+from objective_inputs import DISCRETE, LineEncoder, change_weights, fit, make_batch
 
 from sb3_abisim.networks.augmentations import random_crop, random_noise, random_shift
 from sb3_abisim.objectives.curl import CURL, curl_loss
@@ -25,13 +25,15 @@ def test_loss_equals_loop():
     loss, terms = curl_loss(query, key, weight)
     assert float(loss) == pytest.approx(total / 4, rel=1e-5)
     assert float(terms["accuracy"]) == hits / 4
-    # The weight is not symmetric, so its transpose tells which side each embedding stands on.
+    # The weight is not symmetric, so its transpose shows which side each embedding stands on.
     assert float(curl_loss(query, key, weight.T)[0]) != pytest.approx(float(loss), rel=1e-2)
 
 
 @th.no_grad()
 def test_both_copies_are_changed_each_in_its_own_way(monkeypatch):
+    th.manual_seed(0)
     objective, batch = CURL(LineEncoder(), DISCRETE, strength=0.3), make_batch(DISCRETE, 4)
+    change_weights(objective.key_encoder)
     th.manual_seed(5)
     loss, _ = objective.loss(batch)
     th.manual_seed(5)
@@ -62,7 +64,7 @@ def test_similarity_starts_as_a_dot_product():
     assert th.equal(CURL(LineEncoder(), DISCRETE).weight.detach(), th.eye(5))
 
 
-def test_finds_the_other_copy_of_unseen_pictures():
+def test_finds_the_other_copy_of_unseen_observations():
     th.manual_seed(0)
     objective = CURL(LineEncoder(), DISCRETE, strength=0.02)
     unseen = make_batch(DISCRETE, 64, seed=9)
@@ -72,7 +74,7 @@ def test_finds_the_other_copy_of_unseen_pictures():
 
 
 def ramp(n=3, height=8, width=6):
-    """Pictures whose intensity tells row and column."""
+    """Images whose intensity shows row and column."""
     rows, columns = th.arange(height)[:, None], th.arange(width)
     return (rows * 10 + columns).float().expand(n, 2, height, width) / 100
 
@@ -84,7 +86,7 @@ def test_noise_has_the_given_strength():
     assert abs(float(noise.mean())) < 0.01
 
 
-def test_shift_moves_whole_pictures_and_repeats_the_border():
+def test_shift_moves_whole_images_and_repeats_the_border():
     th.manual_seed(0)
     images = ramp(40)
     shifted = random_shift(images, 0.25)
@@ -111,13 +113,13 @@ def test_a_small_shift_is_a_pixel_and_none_is_none():
     assert 25 < int(moved.sum()) < 40  # eight of nine
 
 
-def test_crop_enlarges_a_window_within_the_picture():
+def test_crop_enlarges_a_window_within_the_image():
     th.manual_seed(0)
     images = ramp(30, 16, 16)
     cropped = random_crop(images, 0.5)
     assert cropped.shape == images.shape
     for image in cropped:
-        # Half of the rows over the full height: inside the picture intensity rises half as fast as in the original.
+        # Half of the rows over the full height: inside the image intensity rises half as fast as in the original.
         th.testing.assert_close(image[0, 9, 4] - image[0, 5, 4], th.tensor(0.2))
         assert float(image.min()) >= float(images.min()) and float(image.max()) <= float(images.max())
     corners = {round(float(image[0, 0, 0]), 3) for image in cropped}

@@ -10,9 +10,12 @@ import time
 import pytest
 from pretrain_inputs import SETTINGS, collect_grids, run
 
-from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
+from sb3_abisim.pretraining.checkpoint import Checkpoints
 from sb3_abisim.pretraining.config import load_config
 from sb3_abisim.pretraining.pretrain import pretrain
+from sb3_abisim.pretraining.trainer import PretrainRun
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +49,6 @@ def test_an_interrupted_run_ends_in_the_same_bytes(data, tmp_path, monkeypatch, 
     # Different folders, equal names: what is compared must not hold the path.
     outputs = [tmp_path / name / "encoder.safetensors" for name in ("whole", "stopped")]
     pretrain(objective, data, outputs[0], config, device="cpu", progress_bar=False, verbose=0, **kwargs)
-    from sb3_abisim.pretraining.trainer import PretrainRun
-
     update, count = PretrainRun._update, 0
 
     def interrupt(self, batch):
@@ -124,8 +125,6 @@ def test_finished_run_is_left_alone_and_other_settings_are_refused(data, tmp_pat
 
 
 def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretraining.trainer import PretrainRun
-
     monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
     with pytest.raises(ValueError, match="other settings"):
@@ -133,8 +132,6 @@ def test_checkpoint_of_other_settings_is_refused(data, tmp_path, monkeypatch):
 
 
 def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretraining.trainer import PretrainRun
-
     monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
     path = sorted((tmp_path / "ssi.run").glob("checkpoint-*"))[-1]
@@ -150,8 +147,6 @@ def test_damaged_checkpoint_is_refused(data, tmp_path, monkeypatch):
 @pytest.mark.parametrize(("log_interval", "n_rows", "saved"), [(7, 5, [14, 28]), (30, 1, [30]), (100, 1, [30])])
 def test_checkpoints_and_rows_come_whatever_the_intervals(data, tmp_path, monkeypatch, log_interval, n_rows, saved):
     """At the first row after each interval; the last row is at the end."""
-    from sb3_abisim.pretraining.trainer import PretrainRun
-
     positions, plain = [], PretrainRun.save
     monkeypatch.setattr(PretrainRun, "save", lambda run: positions.append(run.n_updates) or plain(run))
     fixed = {"objective_kwargs.adaptive": None, "objective_kwargs.l1_penalty": 0.25}
@@ -162,8 +157,6 @@ def test_checkpoints_and_rows_come_whatever_the_intervals(data, tmp_path, monkey
 
 
 def test_keeps_the_last_two_checkpoints(data, tmp_path, monkeypatch):
-    from sb3_abisim.pretraining.trainer import PretrainRun
-
     monkeypatch.setattr(PretrainRun, "finish", lambda self: None)
     run(data, tmp_path / "ssi.safetensors")
     names = [path.name for path in sorted((tmp_path / "ssi.run").glob("checkpoint-*"))]
@@ -178,8 +171,55 @@ def test_second_writer_is_refused(data, tmp_path):
         run(data, tmp_path / "ssi.safetensors")
 
 
-def test_files_from_before_runs_of_transitions_existed_stay_those_of_the_same_run(data, tmp_path):
+def test_files_from_before_chunks_existed_stay_those_of_the_same_run(data, tmp_path):
     output = run(data, tmp_path / "ssi.safetensors")
     assert "chunk_length" not in load_encoder(str(output)).metadata["settings"]
     with pytest.raises(ValueError, match="chunk_length: None there, 8 here"):
         run(data, output, chunk_length=8)
+
+
+def old_names(settings):
+    """Settings as files held them before they were renamed."""
+    names = {"eval_fraction": "holdout", "dataset_hash": "dataset_digest", "delta_scale": "change_weight"}
+    values = {"chance_corrected": "above_chance"}
+    renamed = {}
+    for name, value in settings.items():
+        value = old_names(value) if isinstance(value, dict) else value
+        renamed[names.get(name, name)] = values.get(value, value) if isinstance(value, str) else value
+    return renamed
+
+
+def test_a_finished_file_with_the_names_of_another_version_is_left_alone(data, tmp_path):
+    output = run(data, tmp_path / "ssi.safetensors")
+    file, dataset = load_encoder(output), TransitionDataset(data)
+    settings = old_names(file.metadata["settings"])
+    assert settings["holdout"] == 0.05 and settings["objective_kwargs"]["adaptive"] == "above_chance"
+    metadata = {key: file.metadata[key] for key in ("env_id", "env_kwargs", "objective", "dataset_hash")}
+    spaces = {"observation_space": dataset.observation_space, "action_space": dataset.action_space}
+    frames = dataset.frames([0, 1])
+    save_encoder(output, file.encoder, settings=settings, reference_observations=frames, **metadata, **spaces)
+    content = output.read_bytes()
+    run(data, output)
+    assert output.read_bytes() == content
+    with pytest.raises(ValueError, match=r"eval_fraction: 0\.05 there, 0\.1 here"):
+        run(data, output, eval_fraction=0.1)
+
+
+def test_a_checkpoint_with_the_names_of_another_version_is_gone_on_from(data, tmp_path, monkeypatch):
+    whole = run(data, tmp_path / "whole" / "ssi.safetensors")
+    plain = Checkpoints.save
+
+    def interrupt(self, module, optimizer, n_updates, rows):
+        old = [
+            {name.replace("eval/", "test/").replace("inverse_nll", "prediction"): x for name, x in r.items()}
+            for r in rows
+        ]
+        plain(Checkpoints(self.folder, old_names(self.settings)), module, optimizer, n_updates, old)
+        raise Interrupted
+
+    with monkeypatch.context() as patch, pytest.raises(Interrupted):
+        patch.setattr(Checkpoints, "save", interrupt)
+        run(data, tmp_path / "stopped" / "ssi.safetensors")
+    stopped = run(data, tmp_path / "stopped" / "ssi.safetensors")
+    for suffix in (".safetensors", ".json"):
+        assert stopped.with_suffix(suffix).read_bytes() == whole.with_suffix(suffix).read_bytes()

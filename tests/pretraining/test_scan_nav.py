@@ -5,19 +5,20 @@ import pytest
 from sb3_abisim.data.collect import collect
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.config import load_config
-from sb3_abisim.pretraining.pretrain import OBJECTIVE_NAMES, pretrain
+from sb3_abisim.pretraining.pretrain import pretrain
+from sb3_abisim.registry import methods
 
 SETTINGS = {"n_updates": 4, "batch_size": 16, "log_interval": 2, "checkpoint_interval": 4, "eval_fraction": 0}
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scan") / "flat"
+    folder = tmp_path_factory.mktemp("scan") / "apartment"
     collect("ScanNav-v0", 400, folder, n_envs=8, env_kwargs={"stop": "auto", "scenes": 0})
     return folder
 
 
-@pytest.mark.parametrize("objective", OBJECTIVE_NAMES)
+@pytest.mark.parametrize("objective", [name for name, method in methods().items() if method.is_pretrained])
 def test_objectives_of_the_small_encoder(data, tmp_path, objective):
     base = "ScanNav-v0/ssi" if objective == "abisim" else None
     config = load_config(objective, "ScanNav-v0", SETTINGS)
@@ -28,7 +29,7 @@ def test_objectives_of_the_small_encoder(data, tmp_path, objective):
 
 
 def test_the_residual_network(tmp_path):
-    folder = tmp_path / "flat"
+    folder = tmp_path / "apartment"
     collect("ScanNav-v0", 64, folder, n_envs=8, env_kwargs={"stop": "auto", "scenes": 0, "image_size": 64})
     settings = {**SETTINGS, "n_updates": 2, "batch_size": 8, "chunk_length": 1}
     settings |= {"network": "ScanNavResNet18", "network_kwargs": {"image_size": 64}}

@@ -1,4 +1,4 @@
-"""What a run says about its encoder, and when it refuses to start."""
+"""What a run reports of its encoder, and when it refuses to start."""
 
 import re
 from pathlib import Path
@@ -23,7 +23,7 @@ from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
 
 class Grid(gym.Env):
-    """Random 15 x 15 pictures with discrete or continuous actions."""
+    """Random 15 x 15 observations with discrete or continuous actions."""
 
     observation_space = spaces.Box(0, 255, (3, 15, 15), np.uint8)
 
@@ -35,8 +35,8 @@ class Grid(gym.Env):
         return self.np_random.integers(0, 256, (3, 15, 15), np.uint8), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        picture = self.np_random.integers(0, 256, (3, 15, 15), np.uint8)
-        return picture, float(picture[0, 0, 0]), bool(self.np_random.random() < 0.1), False, {}
+        observation = self.np_random.integers(0, 256, (3, 15, 15), np.uint8)
+        return observation, float(observation[0, 0, 0]), bool(self.np_random.random() < 0.1), False, {}
 
 
 class Recorder(Logger):
@@ -58,8 +58,8 @@ SAVED: dict[str, Any] = {
     "env_kwargs": {},
     "objective": "abisim",
     "settings": {},
-    "dataset_digest": "0" * 64,
-    "golden_observations": np.zeros((1, 3, 15, 15), np.uint8) + 9,
+    "dataset_hash": "0" * 64,
+    "reference_observations": np.zeros((1, 3, 15, 15), np.uint8) + 9,
 }
 
 
@@ -86,23 +86,21 @@ def learn(model: BaseAlgorithm, n_timesteps: int) -> list[float]:
 def test_ppo(encoder: tuple[str, str], freeze: bool, capsys: pytest.CaptureFixture[str]) -> None:
     path, hash = encoder
     model = PPO("CnnPolicy", Grid(), n_steps=16, batch_size=16, n_epochs=1, policy_kwargs=policy_kwargs(path, freeze))
-    relative_weight_change = learn(model, 48)
+    changes = learn(model, 48)
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Encoder")]
     n_parameters = sum(p.numel() for p in make_encoder(Grid.observation_space).parameters())
-    state = "frozen" if freeze else "trained along"
+    state = "frozen" if freeze else "fine-tuned"
     assert lines == [
-        f"Encoder features_extractor: ActionBisimExtractor, source {path}, digest {hash}, "
+        f"Encoder features_extractor: ActionBisimExtractor, source {path}, hash {hash}, "
         f"{n_parameters} parameters, {state}"
     ]
-    assert len(relative_weight_change) == 3 and relative_weight_change[0] == 0.0
-    assert (
-        relative_weight_change[1:] == [0.0, 0.0]
-        if freeze
-        else 0.0 < relative_weight_change[1] < relative_weight_change[2]
-    )
+    assert len(changes) == 3 and changes[0] == 0.0
+    assert changes[1:] == [0.0, 0.0] if freeze else 0.0 < changes[1] < changes[2]
 
 
-def test_drift_is_the_largest_of_several(encoder: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_relative_weight_change_is_the_largest_of_several(
+    encoder: tuple[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
     model = SAC("CnnPolicy", Grid(True), buffer_size=50, learning_starts=100, policy_kwargs=policy_kwargs(encoder[0]))
     with th.no_grad():
         for factor, (_, extractor) in zip((1.5, 1.25), find_extractors(model.policy), strict=True):
@@ -147,11 +145,10 @@ def test_a_model_of_another_encoders_embeddings_does_not_go_on(encoder: tuple[st
 
 def test_untrained_network(capsys: pytest.CaptureFixture[str]) -> None:
     kwargs = {"features_extractor_class": VanillaExtractor}
-    relative_weight_change = learn(
-        PPO("CnnPolicy", Grid(), n_steps=16, batch_size=16, n_epochs=1, policy_kwargs=kwargs), 32
-    )
-    assert "VanillaExtractor, source untrained, random weights" in capsys.readouterr().out
-    assert relative_weight_change[0] == 0.0 < relative_weight_change[1]
+    changes = learn(PPO("CnnPolicy", Grid(), n_steps=16, batch_size=16, n_epochs=1, policy_kwargs=kwargs), 32)
+    out = capsys.readouterr().out
+    assert "VanillaExtractor, source untrained, random weights" in out and "parameters, trained from scratch\n" in out
+    assert changes[0] == 0.0 < changes[1]
 
 
 def test_policy_without_an_encoder_of_ours(capsys: pytest.CaptureFixture[str]) -> None:
@@ -159,11 +156,11 @@ def test_policy_without_an_encoder_of_ours(capsys: pytest.CaptureFixture[str]) -
     assert "none of sb3_abisim's" in capsys.readouterr().out
 
 
-def test_backgrounds_are_stated(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_content_hash_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     env = Grid()
     env.content_hash = "0123abcd"  # type: ignore[attr-defined]
     learn(PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1), 16)
-    assert "Pictures of the training environment: 0123abcd\n" in capsys.readouterr().out
+    assert "Content hash of the training environment: 0123abcd\n" in capsys.readouterr().out
 
 
 def test_stacked_embeddings_are_trained_on(encoder: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:

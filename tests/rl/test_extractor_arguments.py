@@ -7,21 +7,26 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3 as sb3
-from extractor_inputs import FRAMES, SPACE, BatchNormEncoder, Pictures, build, write
+from extractor_inputs import OBSERVATIONS, SPACE, RandomImages, build, register_batch_norm, write
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_abisim
-from sb3_abisim.networks import base as networks
-from sb3_abisim.objectives import OBJECTIVES
-from sb3_abisim.pretraining.pretrain import OBJECTIVE_NAMES
-from sb3_abisim.rl.extractors import ActionBisimExtractor, PretrainedExtractor, VanillaExtractor
-from sb3_abisim.zoo import manager as zoo
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.registry import methods
+from sb3_abisim.rl.extractors import (
+    ActionBisimExtractor,
+    PretrainedExtractor,
+    VanillaExtractor,
+    extractor_class,
+    method_of,
+    network_arguments,
+)
 
 
 @pytest.fixture(autouse=True)
 def batch_norm_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(networks.ENCODERS, "BatchNormEncoder", BatchNormEncoder)
+    register_batch_norm(monkeypatch)
 
 
 @pytest.fixture
@@ -31,23 +36,41 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def batch_norm_path(tmp_path: Path) -> Path:
-    return write(tmp_path / "bn.safetensors", "BatchNormEncoder")
+    return write(tmp_path / "bn.safetensors", "BatchNorm")
 
 
-EXTRACTORS = {cls.objective: cls for cls in PretrainedExtractor.__subclasses__()}
+EXTRACTORS: dict[str, Any] = {name: extractor_class(name) for name, method in methods().items() if method.is_pretrained}
+NAMES = {
+    "abisim": "ActionBisimExtractor",
+    "acro": "ACROExtractor",
+    "beta_vae": "BetaVAEExtractor",
+    "curl": "CURLExtractor",
+    "info_nce": "InfoNCEExtractor",
+    "ssi": "SSIExtractor",
+    "vanilla": "VanillaExtractor",
+}
 
 
-def test_every_objective_has_an_extractor() -> None:
-    assert set(EXTRACTORS) == set(OBJECTIVES) == set(OBJECTIVE_NAMES)
-    assert {cls.__name__ for cls in EXTRACTORS.values()} | {"VanillaExtractor"} == set(zoo.EXTRACTORS.values())
-    assert all(getattr(sb3_abisim, name) for name in zoo.EXTRACTORS.values())
+@pytest.mark.parametrize("method", NAMES)
+def test_every_method_has_an_extractor(method: str) -> None:
+    made: Any = extractor_class(method)
+    assert made.__name__ == NAMES[method] and getattr(sb3_abisim, NAMES[method]) is made
+    assert method_of(made) == method
+    assert issubclass(made, VanillaExtractor) if method == "vanilla" else made.objective == method
+    assert ":param observation_space:" in made.__doc__ and ":param network_kwargs:" in made.__doc__
+    # A class of the same name belongs to nobody.
+    assert method_of(type(NAMES[method], (PretrainedExtractor,), {})) is None
+
+
+def test_all_methods_are_named_here() -> None:
+    assert set(methods()) == set(NAMES)
 
 
 @pytest.mark.parametrize("objective", EXTRACTORS)
 def test_wrong_class_for_the_file(tmp_path: Path, objective: str) -> None:
     file = str(write(tmp_path / objective, objective=objective))
     right = EXTRACTORS[objective]
-    assert right(SPACE, file).metadata["objective"] == objective  # type: ignore[index]
+    assert right(SPACE, file).metadata["objective"] == objective
     for wrong in set(EXTRACTORS.values()) - {right}:
         text = f"{objective} was trained by '{objective}', not '{wrong.objective}'; use {right.__name__}"
         with pytest.raises(ValueError, match=text):
@@ -55,20 +78,21 @@ def test_wrong_class_for_the_file(tmp_path: Path, objective: str) -> None:
 
 
 def test_file_of_an_unknown_objective(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"trained by 'other'.*known objectives are \['abisim', 'acro'.*'ssi'\]"):
+    with pytest.raises(ValueError, match=r"trained by 'other'.*known methods are abisim, .*ssi, .*--packages imports"):
         ActionBisimExtractor(SPACE, str(write(tmp_path / "other", objective="other")))
 
 
 def test_network_must_be_named_as_the_error_says(batch_norm_path: Path, tmp_path: Path) -> None:
-    wide = str(write(tmp_path / "wide", "BatchNormEncoder", width=5))
-    remedy = {"network": "BatchNormEncoder", "network_kwargs": {"width": 5}}
-    text = r"network='BatchNormEncoder', network_kwargs=\{'width': 5\}"
+    wide = str(write(tmp_path / "wide", "BatchNorm", width=5))
+    remedy = {"network": "BatchNorm", "network_kwargs": {"width": 5}}
+    text = r"network='BatchNorm', network_kwargs=\{'width': 5\}"
     with pytest.raises(ValueError, match=rf"Nav2DEncoder.*{text}"):
         ActionBisimExtractor(SPACE, wide)
-    with pytest.raises(ValueError, match=rf"'width': 4.*{text}"):
-        ActionBisimExtractor(SPACE, wide, network="BatchNormEncoder")
-    with pytest.raises(ValueError, match=rf"unknown encoder network 'Nonsense'.*{text}"):
+    with pytest.raises(ValueError, match=rf"the extractor builds .*'kwargs': {{}}.*{text}"):
+        ActionBisimExtractor(SPACE, wide, network="BatchNorm")
+    with pytest.raises(ValueError, match=rf"unknown network 'Nonsense'.*{text}"):
         ActionBisimExtractor(SPACE, wide, network="Nonsense")
+    assert network_arguments(load_encoder(wide)) == remedy
     assert ActionBisimExtractor(SPACE, wide, **remedy).features_dim == 6  # type: ignore[arg-type]
     # The same is required where the file is absent, so that a mistake is not found out on another machine.
     assert ActionBisimExtractor(SPACE, "absent", **remedy).n_parameters == 3 * 9 * 5 + 5 + 10 + 125 * 6 + 6  # type: ignore[arg-type]
@@ -105,11 +129,13 @@ def test_observation_space(path: Path, extractor_class: Any, space: gym.Space[An
 
 def test_normalized_images_are_refused(path: Path) -> None:
     policy_kwargs = build("PPO", path, True).policy_kwargs
-    vec_env = VecNormalize(DummyVecEnv([Pictures]))
+    vec_env = VecNormalize(DummyVecEnv([RandomImages]))
     with pytest.raises(ValueError, match="norm_obs=False"):
         sb3.PPO("CnnPolicy", vec_env, policy_kwargs={**policy_kwargs, "normalize_images": False})
-    model = sb3.PPO("CnnPolicy", Pictures(), policy_kwargs={**policy_kwargs, "normalize_images": False}, device="cpu")
-    black = np.zeros_like(FRAMES)
+    model = sb3.PPO(
+        "CnnPolicy", RandomImages(), policy_kwargs={**policy_kwargs, "normalize_images": False}, device="cpu"
+    )
+    black = np.zeros_like(OBSERVATIONS)
     model.predict(black)
     with pytest.raises(ValueError, match=r"reach 255.*remove normalize_images=False"):
-        model.predict(FRAMES)
+        model.predict(OBSERVATIONS)

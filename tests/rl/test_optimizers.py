@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import stable_baselines3 as sb3
 import torch as th
-from extractor_inputs import ALGORITHMS, Pictures, build, write
+from extractor_inputs import ALGORITHMS, RandomImages, build, write
 from torch import nn
 
 from sb3_abisim.rl.extractors import ActionBisimExtractor, VanillaExtractor
@@ -113,13 +113,13 @@ def test_wrong_factor(factor: float) -> None:
 
 
 def with_rate(name: str, path: Path, factor: float) -> Any:
-    """The model of the tests of extractors, with our optimizer, an encoder trained along and no weight decay."""
+    """The model of the tests of extractors, with our optimizer, a fine-tuned encoder and no weight decay."""
     model = build(name, path, False)
     kwargs = copy.deepcopy(model.policy_kwargs)
     kwargs.pop("use_sde", None)
     kwargs |= {"optimizer_class": EncoderLRAdam, "optimizer_kwargs": {"encoder_lr_factor": factor, "eps": 1e-12}}
     algorithm, settings = ALGORITHMS[name]
-    env = Pictures(continuous=name in ("SAC", "TD3", "TQC"))
+    env = RandomImages(continuous=name in ("SAC", "TD3", "TQC"))
     return algorithm(type(model.policy), env, seed=5, device="cpu", learning_rate=LR, policy_kwargs=kwargs, **settings)
 
 
@@ -170,7 +170,7 @@ def test_inside_the_algorithms(path: Path, name: str) -> None:
     model.save(path.parent / "model.zip")
     path.unlink()
     loaded = type(model).load(
-        path.parent / "model.zip", env=Pictures(continuous=name in ("SAC", "TD3", "TQC")), device="cpu"
+        path.parent / "model.zip", env=RandomImages(continuous=name in ("SAC", "TD3", "TQC")), device="cpu"
     )
     for before, after in zip(optimizers(model), optimizers(loaded), strict=True):
         assert type(after) is EncoderLRAdam
@@ -192,7 +192,7 @@ def test_untrained_network() -> None:
         "optimizer_class": EncoderLRAdam,
         "optimizer_kwargs": {"encoder_lr_factor": 0.5},
     }
-    model = sb3.PPO("CnnPolicy", Pictures(), n_steps=8, batch_size=8, policy_kwargs=kwargs, device="cpu")
+    model = sb3.PPO("CnnPolicy", RandomImages(), n_steps=8, batch_size=8, policy_kwargs=kwargs, device="cpu")
     assert [len(group["params"]) for group in optimizers(model)[0].param_groups] == [12, 6]
 
 
@@ -203,16 +203,16 @@ def test_without_an_encoder_to_train(path: Path) -> None:
     shared = copy.deepcopy(frozen) | {"share_features_extractor": True}
     shared["features_extractor_kwargs"]["freeze"] = False
     for algorithm, policy, env, kwargs in [
-        (sb3.PPO, "MlpPolicy", Pictures(), {}),
-        (sb3.PPO, "CnnPolicy", Pictures(), frozen),
-        (sb3.SAC, "CnnPolicy", Pictures(continuous=True), shared),
+        (sb3.PPO, "MlpPolicy", RandomImages(), {}),
+        (sb3.PPO, "CnnPolicy", RandomImages(), frozen),
+        (sb3.SAC, "CnnPolicy", RandomImages(continuous=True), shared),
     ]:
         with pytest.raises(ValueError, match=r"encoder_lr_factor=0\.5, but none of \d+ parameters is an encoder's"):
             algorithm(policy, env, device="cpu", policy_kwargs=kwargs | copy.deepcopy(rate))
 
 
 def test_from_yaml(path: Path) -> None:
-    """The string of a zoo YAML, evaluated where the zoo evaluates it."""
+    """The text of a zoo YAML, evaluated where the zoo evaluates it."""
     namespace = vars(importlib.import_module("rl_zoo3.exp_manager"))
     text = (
         "dict(features_extractor_class=get_class_by_name('sb3_abisim.rl.extractors.ActionBisimExtractor'), "
@@ -220,7 +220,7 @@ def test_from_yaml(path: Path) -> None:
         "optimizer_class=get_class_by_name('sb3_abisim.rl.optimizers.EncoderLRAdam'), "
         "optimizer_kwargs={'encoder_lr_factor': 0.1, 'eps': 1e-5})"
     )
-    model = sb3.DQN("CnnPolicy", Pictures(), buffer_size=50, policy_kwargs=eval(text, namespace), device="cpu")
+    model = sb3.DQN("CnnPolicy", RandomImages(), buffer_size=50, policy_kwargs=eval(text, namespace), device="cpu")
     (optimizer,) = optimizers(model)
     assert [group["lr_factor"] for group in optimizer.param_groups] == [1.0, 0.1]
     assert [group["eps"] for group in optimizer.param_groups] == [1e-5, 1e-5]

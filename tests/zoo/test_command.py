@@ -1,5 +1,6 @@
-"""The zoo's commands themselves, in this process and in fresh ones."""
+"""rl-zoo3's commands with our methods, in this process and in fresh ones."""
 
+import gc
 import importlib
 import os
 import subprocess
@@ -13,22 +14,19 @@ import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 from torch import nn
-from zoo_inputs import SMALL, write_encoder
+from zoo_inputs import SMALL, run, write_encoder
 
 from sb3_abisim.networks.encoder_file import load_encoder
-from sb3_abisim.rl import merge as frozen
+from sb3_abisim.rl import merge
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
-from sb3_abisim.zoo import manager as zoo
+from sb3_abisim.zoo.command import SCRIPTS, for_rl_zoo3
 from sb3_abisim.zoo.evaluate import evaluate_final
+from sb3_abisim.zoo.manager import MethodExperimentManager
+from sb3_abisim.zoo.runs import read_yaml
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-def run(monkeypatch: pytest.MonkeyPatch, *argv: str) -> None:
-    monkeypatch.setattr(sys, "argv", [])
-    zoo.main(list(argv))
 
 
 @pytest.mark.parametrize(
@@ -58,10 +56,10 @@ def test_train_and_enjoy(
     small = ["--eval-freq", "200", "--eval-episodes", "1", "-params", *SMALL[algo]]
     run(monkeypatch, "train", *common, "-n", "300", "--seed", "1", "--conf-file", word, *small)
     out = capsys.readouterr().out
-    state = "frozen" if method.endswith("frozen") else "trained along"
+    state = "frozen" if method.endswith("frozen") else "fine-tuned" if hash else "trained from scratch"
     # One line for each network with an encoder of its own.
     assert out.count("Encoder ") == (2 if algo == "sac" else 1)
-    assert f"digest {hash}" in out if hash else "random weights" in out
+    assert f"hash {hash}" in out if hash else "random weights" in out
     assert state in out and (state == "frozen" or "| encoder/ " in out)
     folder = tmp_path / algo / f"{env_id}_1"
     evaluations = np.load(folder / "evaluations.npz")
@@ -76,7 +74,7 @@ def test_train_and_enjoy(
 def test_a_frozen_run_acts_on_the_encoder_it_was_trained_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """Its folder, moved elsewhere, with another encoder now under the old name; fused, without any encoder file."""
+    """Its folder, moved elsewhere, with another encoder now under the old name; merged, without any encoder file."""
     encoder = tmp_path / "mine.safetensors"
     hash = write_encoder(encoder, "Nav2D-v0")
     argv = ["--algo", "ppo", "--env", "Nav2D-v0", "--num-threads", "1"]
@@ -99,26 +97,125 @@ def test_a_frozen_run_acts_on_the_encoder_it_was_trained_on(
     assert encoding is not None and encoding.encoder_file.hash == hash
     folder = tmp_path / "moved" / "ppo" / "Nav2D-v0_1"
     assert np.load(evaluate_final(folder, 2))["stochastic/standard/results"].shape == (2,)
-    frozen.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-o", str(tmp_path / "fused.zip")])
-    model = PPO.load(tmp_path / "fused.zip", device="cpu")
+    merge.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-o", str(tmp_path / "merged.zip")])
+    model = PPO.load(tmp_path / "merged.zip", device="cpu")
     assert model.policy.features_extractor.hash == hash
     on_embeddings = PPO.load(folder / "Nav2D-v0.zip", device="cpu")
-    frames = np.random.default_rng(0).integers(0, 256, (20, 3, 15, 15), np.uint8)
+    observations = np.random.default_rng(0).integers(0, 256, (20, 3, 15, 15), np.uint8)
     with th.no_grad():
-        expected = on_embeddings.policy.predict_values(model.policy.features_extractor(th.from_numpy(frames) / 255))
-        assert th.allclose(model.policy.predict_values(th.from_numpy(frames)), expected, atol=1e-5)
+        expected = on_embeddings.policy.predict_values(
+            model.policy.features_extractor(th.from_numpy(observations) / 255)
+        )
+        assert th.allclose(model.policy.predict_values(th.from_numpy(observations)), expected, atol=1e-5)
     with pytest.raises(SystemExit):
-        frozen.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-e", "mistyped", "-o", str(tmp_path / "x.zip")])
+        merge.main(["--algo", "ppo", str(folder / "Nav2D-v0.zip"), "-e", "mistyped", "-o", str(tmp_path / "x.zip")])
     assert "no encoder file 'mistyped'" in capsys.readouterr().err
 
 
-# The zoo has already opened its monitor files when it wraps the environment.
+def test_flags_in_the_form_of_rl_zoo3() -> None:
+    flags = ["--algo", "ppo", "--packages", "a", "b.c", "-n", "-1", "-params", "gamma:0.9", "learning_rate:lin_1e-4"]
+    flags += ["ent_coef:1e-3", "train_freq:(1,'episode')", "use_sde:true", "policy_kwargs:{net_arch: [7]}", "a:null"]
+    flags += ["--env-kwargs", "split:eval", "path:'a:b'", "--packages=d", "-params=n_steps:5", "-conf", "ssi=x,frozen"]
+    words, packages = for_rl_zoo3(flags)
+    assert packages == ["a", "b.c", "d"]
+    assert words[:4] == ["--algo", "ppo", "-n", "-1"]
+    assert words[4:12] == [
+        "-params",
+        "gamma:0.9",
+        "learning_rate:'lin_1e-4'",
+        "ent_coef:0.001",
+        "train_freq:(1, 'episode')",
+        "use_sde:True",
+        "policy_kwargs:{'net_arch': [7]}",
+        "a:None",
+    ]
+    assert words[12:] == ["--env-kwargs", "split:'eval'", "path:'a:b'", "-params", "n_steps:5", "-conf", "ssi=x,frozen"]
+    for flags, message in (
+        (["-params", "gamma"], "-params takes NAME:VALUE words"),
+        (["--eval-env-kwargs", "1:2"], "--eval-env-kwargs takes NAME:VALUE words"),
+        (["-params", "policy_kwargs.net_arch:[7]"], "-params sets whole hyperparameters.*give policy_kwargs, or write"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            for_rl_zoo3(flags)
+
+
+def test_values_reach_rl_zoo3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = ["train", "--algo", "ppo", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "16", "--eval-freq", "-1"]
+    words += ["--conf-file", "vanilla", "--env-kwargs", "layout:maze", "--packages", "toy_env", "--num-threads", "1"]
+    pairs = ["n_envs:1", "n_steps:16", "batch_size:16", "learning_rate:lin_1e-4", "normalize:false"]
+    run(monkeypatch, *words, "-params", *pairs)
+    out = capsys.readouterr().out
+    assert "'learning_rate', 'lin_1e-4'" in out and "env_kwargs={'layout': 'maze'}" in out
+    # The run's folder says what has to be imported.
+    args = read_yaml(tmp_path / "ppo" / "Nav2D-v0_1" / "Nav2D-v0" / "args.yml")
+    assert args["gym_packages"] == ["toy_env"]
+
+
+# rl-zoo3 leaves the monitor files open that it had opened before the mistake.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_mistyped_encoder_stops_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    argv = ["train", "--algo", "dqn", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "300", "--eval-freq", "-1"]
-    for word in ("abisim=tpyo.safetensors", "abisim=tpyo.safetensors,frozen"):
-        with pytest.raises(FileNotFoundError, match=r"no encoder file 'tpyo\.safetensors'"):
-            run(monkeypatch, *argv, "--conf-file", word, "-params", *SMALL["dqn"])
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--env Nonsense-v0", "Nonsense-v0 not found in gym registry"),
+        ("--env Nav2D-v0 --conf-file abisin", "'abisin' is no YAML or Python file, module or method"),
+        ("--env Nav2D-v0 --conf-file abisim=tpyo.safetensors", "no encoder file 'tpyo.safetensors'"),
+        ("--env Nav2D-v0 --conf-file abisim=tpyo.safetensors,frozen", "no encoder file 'tpyo.safetensors'"),
+        ("--env Nav2D-v0 --conf-file vanilla -params policy_kwargs:{}", "-params policy_kwargs would undo"),
+        ("--env Nav2D-v0 --conf-file vanilla -params nonsense:1", "unexpected keyword argument 'nonsense'"),
+        ("--env Nav2D-v0 --conf-file vanilla --env-kwargs nonsense:1", "unexpected keyword argument 'nonsense'"),
+        ("--env Nav2D-v0 -params gamma", "-params takes NAME:VALUE words"),
+        ("--env Nav2D-v0 --packages no_such_module", "--packages: cannot import 'no_such_module'"),
+        ("--env Nav2D-v0 -i no_such_model.zip", "trained_agent must be a valid path"),
+        ("--env Toy-v0 --packages toy_env --conf-file ssi", "no encoder ships for this environment"),
+    ],
+)
+def test_mistakes_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, words: str, message: str
+) -> None:
+    # An earlier run of this process has begun to train.
+    monkeypatch.setattr(MethodExperimentManager, "has_begun", True)
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, "train", "--algo", "ppo", "-f", str(tmp_path), "-n", "64", *words.split(" "))
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("sb3-abisim train: error: ") and message in error
+    # Here rather than in a later test, which ends with a warning as an error.
+    gc.collect()
+
+
+@pytest.mark.parametrize("error", [ValueError, TypeError])
+def test_errors_of_training_keep_their_traceback(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: type[Exception]
+) -> None:
+    def collect_rollouts(*_: Any, **__: Any) -> bool:
+        raise error("unexpected keyword argument, in training")
+
+    monkeypatch.setattr(PPO, "collect_rollouts", collect_rollouts)
+    words = ["--algo", "ppo", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "64", "--eval-freq", "-1"]
+    with pytest.raises(error, match="in training"):
+        run(monkeypatch, "train", *words, "--conf-file", "vanilla", "-params", *SMALL["ppo"])
+
+
+def test_errors_that_are_no_mistakes_keep_their_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def setup_experiment(_: Any) -> None:
+        raise TypeError("unsupported operand")
+
+    monkeypatch.setattr(MethodExperimentManager, "setup_experiment", setup_experiment)
+    with pytest.raises(TypeError, match="unsupported operand"):
+        run(monkeypatch, "train", "--algo", "ppo", "--env", "Nav2D-v0", "-f", str(tmp_path))
+
+
+@pytest.mark.parametrize("words", [["train"], ["enjoy"], *(["zoo", name] for name in SCRIPTS)])
+def test_help_shows_an_example(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, *words, "--help")
+    out = capsys.readouterr().out
+    assert not stopped.value.code and f"example: sb3-abisim {' '.join(words)} " in out
+    assert "usage: " in out and ("METHOD[=ENCODER][,frozen]" in out) == (words[-1] == "train")
 
 
 def test_optimize_keeps_the_encoder(
@@ -147,10 +244,12 @@ def test_optimize_keeps_the_encoder(
     assert capsys.readouterr().out.count(hash) == 2
 
 
-def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stopped:
-        zoo.main(["trian", "--algo", "ppo"])
-    assert stopped.value.code == 2 and "train" in capsys.readouterr().err
+        run(monkeypatch, "zoo", "trian", "--algo", "ppo")
+    assert stopped.value.code == 2 and "unknown command 'trian'; known are train, enjoy" in capsys.readouterr().err
+    run(monkeypatch, "zoo")
+    assert "A command of rl-zoo3: train, enjoy, record_video" in capsys.readouterr().out
 
 
 def _python(*argv: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -166,21 +265,54 @@ def test_plain_zoo_command_in_the_checkout(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert f"Loading hyperparameters from: {ROOT / 'hyperparams' / 'ppo.yml'}" in done.stdout
     hash = load_encoder("DistractorPointMaze-v0/abisim").hash
-    assert f"ActionBisimExtractor, source DistractorPointMaze-v0/abisim, digest {hash}" in done.stdout
+    assert f"ActionBisimExtractor, source DistractorPointMaze-v0/abisim, hash {hash}" in done.stdout
     done = _python("-m", "rl_zoo3.enjoy", *argv, "-n", "130", "--no-render", cwd=ROOT)
     assert done.returncode == 0 and "Mean reward: -" in done.stdout, done.stderr
 
 
-def test_zoo_command_elsewhere(tmp_path: Path) -> None:
-    argv = ["--algo", "ppo", "--env", "Nav2D-v0", "-n", "64", "--eval-freq", "-1"]
-    argv += ["--gym-packages", "sb3_abisim.zoo.manager", "--conf-file", "vanilla", "-params", *SMALL["ppo"]]
-    done = _python("-m", "rl_zoo3.train", *argv, cwd=tmp_path)
+def test_record_video_in_the_checkout(tmp_path: Path) -> None:
+    """It imports the manager first, and with it custom_envs, while the manager's module is half done."""
+    encoder = tmp_path / "mine.safetensors"
+    write_encoder(encoder, "DistractorPointMaze-v0", "ssi")
+    argv = ["--algo", "ppo", "--env", "DistractorPointMaze-v0", "-f", str(tmp_path)]
+    small = ["-n", "64", "--eval-freq", "-1", "--num-threads", "1", "-params", *SMALL["ppo"]]
+    done = _python("-m", "rl_zoo3.train", *argv, "--conf-file", f"ssi={encoder},frozen", *small, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    # The copy in the run's folder is what it needs.
+    encoder.unlink()
+    done = _python("-m", "rl_zoo3.record_video", *argv, "-n", "20", cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "ppo" / "DistractorPointMaze-v0_1" / "videos").glob("*.mp4"))
+
+
+def test_plain_commands_elsewhere(tmp_path: Path) -> None:
+    encoder = tmp_path / "mine.safetensors"
+    hash = write_encoder(encoder, "Nav2D-v0", "ssi")
+    argv = ["--algo", "ppo", "--env", "Nav2D-v0", "--gym-packages", "sb3_abisim.zoo", "--num-threads", "1"]
+    small = ["-n", "64", "--eval-freq", "-1", "--conf-file", f"ssi={encoder},frozen", "-params", *SMALL["ppo"]]
+    done = _python("-m", "rl_zoo3.train", *argv, *small, cwd=tmp_path)
+    assert (
+        done.returncode == 0 and f"Encoder of the environment: VecEncodeObservations, source {encoder}" in done.stdout
+    )
+    assert f"hash {hash}" in done.stdout, done.stderr
+    encoder.unlink()
+    done = _python("-m", "rl_zoo3.enjoy", *argv, "-f", "logs", "-n", "60", "--no-render", cwd=tmp_path)
+    assert done.returncode == 0 and "Mean reward" in done.stdout, done.stderr
+
+
+def test_one_command_elsewhere(tmp_path: Path) -> None:
+    argv = ["--algo", "ppo", "--env", "Nav2D-v0", "-n", "64", "--eval-freq", "-1", "--num-threads", "1"]
+    argv += ["--conf-file", "vanilla", "-params", *SMALL["ppo"]]
+    done = _python("-m", "sb3_abisim", "train", *argv, cwd=tmp_path)
     assert done.returncode == 0 and "Encoder features_extractor: VanillaExtractor" in done.stdout, done.stderr
+    folder = tmp_path / "logs" / "ppo" / "Nav2D-v0_1" / "Nav2D-v0"
+    assert "-m sb3_abisim train --algo ppo" in (folder / "command.txt").read_text()
 
 
 def test_install_from_within_the_import_of_the_zoo() -> None:
     """Programs that import ExperimentManager first import custom_envs while that module is half done."""
-    code = "from rl_zoo3.exp_manager import ExperimentManager as E; import rl_zoo3.exp_manager as m;"
-    code += "assert E.sb3_abisim_installed and m.ExperimentManager is E"
+    code = "from rl_zoo3.exp_manager import ExperimentManager as E; import rl_zoo3.exp_manager as m, rl_zoo3, sys;"
+    code += "assert E.__name__ == 'MethodExperimentManager' and m.ExperimentManager is E;"
+    code += "assert rl_zoo3.exp_manager is m is sys.modules['rl_zoo3.exp_manager']"
     done = _python("-c", code, cwd=ROOT)
     assert done.returncode == 0, done.stderr

@@ -1,7 +1,9 @@
-"""The zoo's side: hyperparameters, methods and evaluation splits. The commands are in test_zoo_commands.py."""
+"""rl-zoo3's manager with our hyperparameters, methods and evaluation splits. The commands are in test_command.py."""
 
 import argparse
 import importlib
+import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,12 @@ from zoo_inputs import SMALL, write_encoder
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.checks import check_trained_with
-from sb3_abisim.rl.extractors import VanillaExtractor
-from sb3_abisim.zoo import manager as zoo
+from sb3_abisim.rl.extractors import VanillaExtractor, extractor_class
+from sb3_abisim.zoo.manager import MethodExperimentManager, install, with_eval_split
+from sb3_abisim.zoo.methods import ENCODING_WRAPPER, MethodRecord, encoding_kwargs, read_entries
+from sb3_abisim.zoo.runs import read_run
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
 
@@ -29,7 +34,7 @@ ENTRIES = [
     for path in sorted(resource_path("hyperparams").glob("*.yml"))
     for env_id in yaml.safe_load(path.read_text())
 ]
-PRETRAINED = [name for name in zoo.EXTRACTORS if name not in zoo.UNTRAINED]
+PRETRAINED = [name for name, method in methods().items() if method.is_pretrained]
 
 
 @pytest.fixture
@@ -55,34 +60,6 @@ def effective(manager: Any) -> dict[str, Any]:
 # Methods.
 
 
-def test_method_words() -> None:
-    assert zoo.Method.parse("ssi") == zoo.Method("ssi", None, False)
-    assert zoo.Method.parse("abisim,frozen") == zoo.Method("abisim", None, True)
-    assert zoo.Method.parse("abisim=a=b,c.safetensors") == zoo.Method("abisim", "a=b,c.safetensors", False)
-    assert zoo.Method.parse("ssi=hf://o/r/f.safetensors,frozen") == zoo.Method("ssi", "hf://o/r/f.safetensors", True)
-
-
-@pytest.mark.parametrize("text", ["", "acroo", "abisim,freeze", "ssi=", "ssi=,frozen", "vanilla=x", "vanilla,frozen"])
-def test_wrong_method_words(text: str) -> None:
-    with pytest.raises(ValueError, match=r"give METHOD|takes neither"):
-        zoo.Method.parse(text)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "nonsense(",
-        "dict(net_arch=[1])",
-        "dict(features_extractor_kwargs=3)",
-        "dict(features_extractor_kwargs=get(1))",
-        "f(features_extractor_kwargs={'encoder': 'a/b'})",
-    ],
-)
-def test_policy_kwargs_of_another_form_are_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="policy_kwargs must read"):
-        zoo.Method("ssi").hyperparameters({"policy": "CnnPolicy", "policy_kwargs": text})
-
-
 @pytest.mark.parametrize(("algo", "env_id"), ENTRIES)
 def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: str) -> None:
     default = effective(manager(algo, env_id))
@@ -91,7 +68,10 @@ def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: 
     assert kwargs["features_extractor_class"].__name__ == "ActionBisimExtractor"
     for word, class_name, expected in [
         ("abisim", "ActionBisimExtractor", {"encoder": shipped}),
-        *((name, zoo.EXTRACTORS[name], {"encoder": shipped.replace("/abisim", f"/{name}")}) for name in PRETRAINED),
+        *(
+            (name, get_method(name).extractor, {"encoder": shipped.replace("/abisim", f"/{name}")})
+            for name in PRETRAINED
+        ),
         ("ssi=my runs/x.safetensors", "SSIExtractor", {"encoder": "my runs/x.safetensors"}),
         ("vanilla", "VanillaExtractor", None),
     ]:
@@ -116,10 +96,10 @@ def test_frozen_puts_the_encoder_into_the_environment(manager: Any, algo: str, e
     ]:
         _, saved = manager(algo, env_id, word).read_hyperparameters()
         assert saved["vec_env_wrapper"] == [
-            {"sb3_abisim.rl.vec_encode.VecEncodeObservations": {"encoder": encoder, "objective": objective}}
+            {"sb3_abisim.VecEncodeObservations": {"encoder": encoder, "objective": objective}}
         ]
         on_cpu = manager(algo, env_id, word, device="cpu").read_hyperparameters()[0]
-        assert zoo.encoding_kwargs(on_cpu) == {"encoder": encoder, "objective": objective, "device": "cpu"}
+        assert encoding_kwargs(on_cpu) == {"encoder": encoder, "objective": objective, "device": "cpu"}
         frozen = effective(manager(algo, env_id, word))
         # The network behind the encoder and all else are the same.
         head = {key: value for key, value in kwargs.items() if not key.startswith("features_extractor")}
@@ -127,16 +107,16 @@ def test_frozen_puts_the_encoder_into_the_environment(manager: Any, algo: str, e
         assert frozen == default | {"policy": "MlpPolicy"}
 
 
-def test_several_environments_are_stepped_as_one(manager: Any, tmp_path: Path) -> None:
+def test_several_environments_are_stepped_as_one_batch(manager: Any, tmp_path: Path) -> None:
     def vec_env_class(algo: str, env_id: str = "Nav2D-v0", config: str | None = None, **kwargs: Any) -> str:
         one = manager(algo, env_id, config, **kwargs)
         one.read_hyperparameters()
         return str(one.vec_env_class.__name__)
 
-    (tmp_path / "own.yml").write_text("Nav2D-v0: {n_envs: 4, n_timesteps: 7, env_wrapper: some.Wrapper}\n")
+    (tmp_path / "custom.yml").write_text("Nav2D-v0: {n_envs: 4, n_timesteps: 7, env_wrapper: some.Wrapper}\n")
     assert vec_env_class("ppo") == vec_env_class("ppo", config="vanilla") == "BatchedVecEnv"
     assert vec_env_class("dqn") == vec_env_class("ppo", hyperparams={"n_envs": 1}) == "DummyVecEnv"
-    assert vec_env_class("ppo", config=str(tmp_path / "own.yml")) == "DummyVecEnv"
+    assert vec_env_class("ppo", config=str(tmp_path / "custom.yml")) == "DummyVecEnv"
     assert vec_env_class("ppo", vec_env_type="subproc") == "SubprocVecEnv"
     assert vec_env_class("ppo", "CartPole-v1") == "DummyVecEnv"
 
@@ -144,7 +124,7 @@ def test_several_environments_are_stepped_as_one(manager: Any, tmp_path: Path) -
 # Hyperparameters.
 
 
-def test_the_yaml_is_a_plain_zoo_file(manager: Any) -> None:
+def test_the_yaml_is_a_conf_file(manager: Any) -> None:
     for algo, env_id in ENTRIES:
         as_file = effective(manager(algo, env_id, str(resource_path("hyperparams") / f"{algo}.yml")))
         assert as_file == effective(manager(algo, env_id))
@@ -179,7 +159,8 @@ def test_every_entry_builds_its_model(manager: Any, tmp_path: Path, algo: str, e
     # Constructing the algorithm has left the weights as they are in the file, bit by bit.
     weights = load_encoder(tmp_path / "mine.safetensors").encoder.state_dict()
     assert all(th.equal(value, weights[name]) for name, value in part.features_extractor.encoder.state_dict().items())
-    assert isinstance(saved["policy_kwargs"], str)
+    # What is saved beside the run is as readable as the YAML file.
+    assert saved["policy_kwargs"]["features_extractor_class"] == "sb3_abisim.ActionBisimExtractor"
     # NatureCNN's defaults for net_arch, "no layers", must not reach our heads.
     head = {"ppo": lambda: model.policy.value_net, "dqn": lambda: model.q_net.q_net[-1], "sac": lambda: model.actor.mu}
     assert head[algo]().in_features == 256
@@ -192,27 +173,28 @@ def test_shipped_encoders() -> None:
         # 256 pixels take a network too large to ship.
         if env_id == "ScanNavPaper-v0":
             continue
-        text = yaml.safe_load((resource_path("hyperparams") / f"{algo}.yml").read_text())[env_id]["policy_kwargs"]
-        folder = text.split("'encoder': '")[1].split("/")[0]
+        kwargs = read_entries(resource_path("hyperparams") / f"{algo}.yml")[env_id]["policy_kwargs"]
+        folder = kwargs["features_extractor_kwargs"]["encoder"].split("/")[0]
         for method in PRETRAINED if env_id != "ScanNav-v0" else ("ssi", "abisim"):
             metadata = load_encoder(f"{folder}/{method}").metadata
             assert (metadata["env_id"], metadata["objective"]) == (folder, method)
-            # Scans are pretrained on without the action stop, which no picture shows.
+            # Scans are pretrained on without the action stop, which no observation shows.
             env = gym.make(env_id, **metadata["env_kwargs"])
             load_encoder(f"{folder}/{method}").check(env.observation_space, env.action_space)
 
 
 def test_other_environments_are_untouched(manager: Any) -> None:
     ours, theirs = manager("ppo", "CartPole-v1"), manager("ppo", "CartPole-v1")
-    original = type(theirs).read_hyperparameters.__wrapped__
-    assert ours.read_hyperparameters() == original(theirs)
+    assert type(ours) is MethodExperimentManager
+    assert ours.read_hyperparameters() == super(MethodExperimentManager, theirs).read_hyperparameters()
+    theirs._spec = None
     assert vars(ours) == vars(theirs)
     assert Path(ours.config).parent.parent == Path(exp_manager.__file__).parent
 
 
-def test_an_own_file_is_read_as_it_is(manager: Any, tmp_path: Path) -> None:
-    (tmp_path / "own.yml").write_text("Nav2D-v0: {policy: MlpPolicy, n_timesteps: 7}\n")
-    assert dict(manager("a2c", "Nav2D-v0", str(tmp_path / "own.yml")).read_hyperparameters()[0]) == {
+def test_a_custom_file_is_read_as_it_is(manager: Any, tmp_path: Path) -> None:
+    (tmp_path / "custom.yml").write_text("Nav2D-v0: {policy: MlpPolicy, n_timesteps: 7}\n")
+    assert dict(manager("a2c", "Nav2D-v0", str(tmp_path / "custom.yml")).read_hyperparameters()[0]) == {
         "policy": "MlpPolicy",
         "n_timesteps": 7,
     }
@@ -223,9 +205,7 @@ def test_mistakes_are_refused(manager: Any) -> None:
         manager("a2c", "Nav2D-v0").read_hyperparameters()
     with pytest.raises(ValueError, match=r"no hyperparameters of sac for PointMaze-v0, only of: ppo"):
         manager("sac", "PointMaze-v0", "ssi").read_hyperparameters()
-    with pytest.raises(
-        ValueError, match=r"'abisin' is no YAML.*one of abisim, ssi, acro, beta_vae, curl, info_nce, vanilla"
-    ):
+    with pytest.raises(ValueError, match=r"'abisin' is no YAML.*one of abisim, .*vanilla"):
         manager("ppo", "Nav2D-v0", "abisin").read_hyperparameters()
     with pytest.raises(ValueError, match="give one of the two"):
         manager("ppo", "Nav2D-v0", "ssi", hyperparams={"policy_kwargs": "dict()"}).read_hyperparameters()
@@ -236,11 +216,11 @@ def test_mistakes_are_refused(manager: Any) -> None:
             manager("ppo", "Nav2D-v0", "ssi,frozen", hyperparams={"normalize": normalize}).read_hyperparameters()
     with pytest.raises(ValueError, match="--trial-id would replace policy_kwargs"):
         manager("ppo", "Nav2D-v0", trial_id=3).read_hyperparameters()
-    with pytest.raises(ValueError, match=r"abisim=mine\.safetensors needs hyperparameters of ours, which CartPole-v1"):
-        manager("ppo", "CartPole-v1", "abisim=mine.safetensors").read_hyperparameters()
+    with pytest.raises(ValueError, match="--trial-id would replace policy_kwargs"):
+        manager("ppo", "Nav2D-v0", str(ROOT / "hyperparams" / "ppo.yml"), trial_id=3).read_hyperparameters()
 
 
-def test_a_run_goes_on_with_its_own_encoder_or_not_at_all(manager: Any, tmp_path: Path) -> None:
+def test_a_run_goes_on_with_its_encoder_or_not_at_all(manager: Any, tmp_path: Path) -> None:
     small = {"n_envs": 2, "n_steps": 8, "batch_size": 8}
     hash, other = (write_encoder(tmp_path / f"{name}.safetensors", "Nav2D-v0", "ssi") for name in ("mine", "other"))
     write_encoder(tmp_path / "acro.safetensors", "Nav2D-v0", "acro")
@@ -258,18 +238,20 @@ def test_a_run_goes_on_with_its_own_encoder_or_not_at_all(manager: Any, tmp_path
     assert experiment(mine, agent).policy.features_extractor.hash == hash
     written = set(tmp_path.glob("**/config.yml"))
     for config, here in (
-        (f"acro={tmp_path / 'acro.safetensors'}", r"ACROExtractor, digest \w{64}"),
-        (f"ssi={tmp_path / 'other.safetensors'}", f"SSIExtractor, digest {other}"),
+        (f"acro={tmp_path / 'acro.safetensors'}", r"ACROExtractor, hash \w{64}"),
+        (f"ssi={tmp_path / 'other.safetensors'}", f"SSIExtractor, hash {other}"),
         ("vanilla", "VanillaExtractor"),
     ):
-        with pytest.raises(
-            ValueError, match=f"trained with SSIExtractor, digest {hash}, not with {here}; give the same"
-        ):
+        with pytest.raises(ValueError, match=f"trained with SSIExtractor, hash {hash}, not with {here}; give the same"):
             experiment(config, agent)
     assert set(tmp_path.glob("**/config.yml")) == written
     # The model has the weights itself.
     (tmp_path / "mine.safetensors").unlink()
     assert experiment(mine, agent).policy.features_extractor.hash == hash
+    # And knows which file it was.
+    latest = max(tmp_path.glob("ppo/*/*/method.json"), key=lambda found: int(found.parent.parent.name.split("_")[-1]))
+    record = MethodRecord.read(latest.parent)
+    assert record is not None and (record.label, record.encoder_hash) == ("ssi", hash)
     experiment("vanilla").save(agent)
     with pytest.raises(ValueError, match="was trained with VanillaExtractor, not with SSIExtractor"):
         experiment(mine, agent)
@@ -290,43 +272,125 @@ def test_evaluation_is_in_the_environment_of_training(manager: Any) -> None:
     assert plain.eval_env_kwargs == {"max_episode_steps": 7}
 
 
-def test_extractors_of_somebody_else_may_hold_ours() -> None:
-    class Own(BaseFeaturesExtractor):
+def test_custom_extractors_may_hold_ours() -> None:
+    class Custom(BaseFeaturesExtractor):
         def __init__(self, space: gym.Space) -> None:
             super().__init__(space, 576)
-            self.picture = VanillaExtractor(space)
+            self.image = VanillaExtractor(space)
 
         def forward(self, observations: th.Tensor) -> th.Tensor:
-            return self.picture(observations)
+            return self.image(observations)
 
-    kwargs = {"features_extractor_class": Own}
+    kwargs = {"features_extractor_class": Custom}
     model = PPO("CnnPolicy", "Nav2D-v0", n_steps=8, batch_size=8, policy_kwargs=kwargs, device="cpu")
     check_trained_with(model, kwargs)
     with pytest.raises(ValueError, match="trained with VanillaExtractor, not with none of our extractors"):
         check_trained_with(model, {})
 
 
-def test_an_own_environment_with_normalized_embeddings_is_refused(manager: Any, tmp_path: Path) -> None:
-    wrapper = f"[{{{zoo.ENCODING_WRAPPER}: {{encoder: x}}}}]"
+def test_another_environment_with_normalized_embeddings_is_refused(manager: Any, tmp_path: Path) -> None:
+    wrapper = f"[{{{ENCODING_WRAPPER}: {{encoder: x}}}}]"
     text = f"CartPole-v1: {{policy: MlpPolicy, n_timesteps: 7, normalize: true, vec_env_wrapper: {wrapper}}}\n"
-    (tmp_path / "own.yml").write_text(text)
+    (tmp_path / "custom.yml").write_text(text)
     with pytest.raises(ValueError, match="would change the embeddings of the frozen encoder"):
-        manager("ppo", "CartPole-v1", str(tmp_path / "own.yml")).read_hyperparameters()
+        manager("ppo", "CartPole-v1", str(tmp_path / "custom.yml")).read_hyperparameters()
 
 
 def test_installing_again_changes_nothing() -> None:
-    cls = exp_manager.ExperimentManager
-    before = dict(vars(cls))
-    zoo.install()
-    importlib.reload(zoo)
-    assert dict(vars(cls)) == before
+    before = exp_manager.ExperimentManager, importlib.import_module("rl_zoo3").create_test_env
+    install()
+    assert before == (MethodExperimentManager, importlib.import_module("rl_zoo3.utils").create_test_env)
+    assert exp_manager.ExperimentManager is before[0]
+    assert importlib.import_module("rl_zoo3").create_test_env is before[1]
 
 
-# Evaluation on unseen clips.
+# What read_run needs of a command's arguments.
+ARGS = {"algo": "ppo", "env": "Nav2D-v0", "seed": 1, "n_timesteps": -1, "env_kwargs": None, "eval_env_kwargs": None}
+ARGS |= {"eval_freq": -1, "eval_episodes": 1}
+
+
+def test_policy_kwargs_of_a_custom_file_may_be_a_text(manager: Any, tmp_path: Path) -> None:
+    """As in every YAML file of rl-zoo3; both forms give the same."""
+    hash = write_encoder(tmp_path / "mine.safetensors", "Nav2D-v0", "ssi")
+    text = "dict(features_extractor_class=get_class_by_name('sb3_abisim.SSIExtractor'), net_arch=[7], "
+    text += f"features_extractor_kwargs={{'encoder': {str(tmp_path / 'mine.safetensors')!r}}}, activation_fn=nn.Tanh)"
+    mapping = {
+        "features_extractor_class": "sb3_abisim.SSIExtractor",
+        "features_extractor_kwargs": {"encoder": str(tmp_path / "mine.safetensors")},
+        "net_arch": [7],
+        "activation_fn": "torch.nn.Tanh",
+    }
+    made = []
+    for kwargs in (text, mapping):
+        entry = {"policy": "CnnPolicy", "n_timesteps": 7, "n_steps": 8, "batch_size": 8, "policy_kwargs": kwargs}
+        (tmp_path / "custom.yml").write_text(yaml.safe_dump({"Nav2D-v0": entry}))
+        made.append(effective(manager("ppo", "Nav2D-v0", str(tmp_path / "custom.yml"))))
+        one = manager("ppo", "Nav2D-v0", str(tmp_path / "custom.yml"), eval_freq=-1)
+        one.args = argparse.Namespace(**ARGS)
+        model, saved = one.setup_experiment()
+        model.env.close()
+        assert model.policy.features_extractor.hash == hash and saved["policy_kwargs"] == kwargs
+        record = MethodRecord.read(one.params_path)
+        assert record is not None and (record.label, record.encoder_hash) == ("ssi", hash)
+        # Two runs of the same hyperparameters on other encoder files have these settings in common.
+        run = read_run(one.save_path)
+        assert "mine.safetensors" not in str(run.settings) and "SSIExtractor" in str(run.settings)
+    assert made[0] == made[1]
+    assert made[0]["policy_kwargs"]["features_extractor_class"] is extractor_class("ssi")
+
+
+def test_records_say_what_a_run_used(manager: Any, tmp_path: Path) -> None:
+    path = tmp_path / "mine.safetensors"
+    hash = write_encoder(path, "Nav2D-v0", "ssi")
+    small = {"n_envs": 2, "n_steps": 8, "batch_size": 8}
+    normalize = {"normalize": "dict(norm_obs=False, norm_reward=True)"}
+    ours = {"features_extractor_class": extractor_class("ssi")}
+    (tmp_path / "custom.yml").write_text("Nav2D-v0: {n_timesteps: 7}\n")
+    for config, kwargs, expected in (
+        (f"ssi={path}", None, MethodRecord("ssi", False, str(path), hash, normalize)),
+        (f"ssi={path},frozen", None, MethodRecord("ssi", True, str(path), hash, normalize)),
+        ("vanilla", None, MethodRecord("vanilla", False, None, None, normalize)),
+        (str(tmp_path / "custom.yml"), {}, MethodRecord(None, False, None, None, {})),
+        (
+            str(tmp_path / "custom.yml"),
+            ours | {"features_extractor_kwargs": {"encoder": path, "freeze": True}},
+            MethodRecord("ssi", True, str(path), hash, {}),
+        ),
+    ):
+        custom = {"policy_kwargs": kwargs, "policy": "CnnPolicy" if kwargs else "MlpPolicy"}
+        hyperparams = small | ({} if kwargs is None else custom)
+        one = manager("ppo", "Nav2D-v0", config, hyperparams=hyperparams, eval_freq=-1)
+        model, _ = one.setup_experiment()
+        model.env.close()
+        assert MethodRecord.read(one.params_path) == expected
+
+
+def test_a_missing_encoder_leaves_no_folder(manager: Any, tmp_path: Path) -> None:
+    for config in ("ssi=mistyped", "ssi=mistyped,frozen"):
+        for optimize in (False, True):
+            one = manager("ppo", "Nav2D-v0", config, optimize_hyperparameters=optimize)
+            with pytest.raises(FileNotFoundError, match="no encoder file 'mistyped'"):
+                one.setup_experiment()
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_that_others_have_imported_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in ``rl_zoo3.train --gym-packages sb3_abisim.zoo``, which has imported the manager before this package."""
+    module = types.ModuleType("somebody")
+    plain = MethodExperimentManager.__base__
+    make_env = importlib.import_module("rl_zoo3").create_test_env.__wrapped__
+    module.__dict__.update(ExperimentManager=plain, create_test_env=make_env, other=plain)
+    monkeypatch.setitem(sys.modules, "somebody", module)
+    install()
+    assert module.ExperimentManager is MethodExperimentManager and module.other is plain
+    assert module.create_test_env is importlib.import_module("rl_zoo3").create_test_env
+
+
+# Evaluation on the evaluation split.
 
 
 @pytest.mark.parametrize("config", [None, "vanilla", str(ROOT / "hyperparams" / "ppo.yml")])
-def test_evaluation_is_on_unseen_clips(manager: Any, config: str | None) -> None:
+def test_evaluation_is_on_the_eval_split(manager: Any, config: str | None) -> None:
     def kwargs(env_id: str = "DistractorPointMaze-v0", **given: Any) -> tuple[dict[str, Any], dict[str, Any]]:
         one = manager("ppo", env_id, config, **given)
         one._preprocess_hyperparams(one.read_hyperparameters()[0])
@@ -365,20 +429,26 @@ def test_evaluation_environments_show_the_clips_of_their_split(manager: Any) -> 
     assert train.content_hash != unseen.content_hash
 
 
-def test_enjoy_is_on_unseen_clips() -> None:
+def test_enjoy_is_on_the_eval_split() -> None:
     seen: list[Any] = []
-    make = zoo._test_env_maker(lambda env_id, *args, **kwargs: seen.append(kwargs["env_kwargs"]))
+
+    def plain(env_id: str, n_envs: int = 1, stats_path: str | None = None, env_kwargs: Any = None) -> None:
+        seen.append(env_kwargs)
+
+    make = with_eval_split(plain)
     make("DistractorPointMaze-v0", env_kwargs={"order": "shuffled"})
     make("DistractorPointMaze-v0", env_kwargs={"split": "train"})
     make("DistractorPointMaze-v0", env_kwargs={"clips": ["sea"]})
     make("ContinuousDistractorPointMaze-v0", n_envs=2, env_kwargs=None)
     make("PointMaze-v0", env_kwargs=None)
+    make("DistractorPointMaze-v0", 1, None, {"order": "shuffled"})
     assert seen == [
         {"order": "shuffled", "split": "eval"},
         {"split": "train"},
         {"clips": ["sea"]},
         {"split": "eval"},
         None,
+        {"order": "shuffled", "split": "eval"},
     ]
     for name in ("rl_zoo3", "rl_zoo3.utils"):
         assert hasattr(importlib.import_module(name).create_test_env, "__wrapped__")

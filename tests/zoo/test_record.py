@@ -1,4 +1,4 @@
-"""Films of zoo runs."""
+"""Recordings of zoo runs."""
 
 import contextlib
 import dataclasses
@@ -10,14 +10,13 @@ import pytest
 import torch as th
 from PIL import Image
 from stable_baselines3 import PPO
-from zoo_inputs import SMALL
+from zoo_inputs import SMALL, run
 
 from sb3_abisim.benchmark.command import main as benchmark
 from sb3_abisim.benchmark.export import export
-from sb3_abisim.zoo import manager as zoo
-from sb3_abisim.zoo import record as film_module
+from sb3_abisim.zoo import record as module
 from sb3_abisim.zoo.evaluate import final_model
-from sb3_abisim.zoo.record import MILLISECONDS, N_LAST, film, main
+from sb3_abisim.zoo.record import MILLISECONDS, N_LAST, main, record
 from sb3_abisim.zoo.runs import find_runs, read_run
 
 
@@ -26,15 +25,14 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in an environment with a short time limit, in which the agent waits at a corner for its end."""
     logs = tmp_path_factory.mktemp("logs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", [])
         words = ["--algo", "ppo", "--env", "Nav2D-v0", "-f", str(logs), "--conf-file", "vanilla", "-n", "100"]
         words += ["--env-kwargs", "max_episode_steps:9", "--eval-freq", "-1", "--num-threads", "1"]
-        zoo.main(["train", *words, "-params", *SMALL["ppo"]])
+        run(patch, "train", *words, "-params", *SMALL["ppo"])
     return logs / "ppo" / "Nav2D-v0_1"
 
 
-def pictures(path: Path) -> list[tuple[int, np.ndarray]]:
-    """Milliseconds and content of each picture that differs from the one before."""
+def frames(path: Path) -> list[tuple[int, np.ndarray]]:
+    """Milliseconds and content of each frame that differs from the one before."""
     with Image.open(path) as gif:
         shown = []
         for i in range(gif.n_frames):
@@ -44,22 +42,22 @@ def pictures(path: Path) -> list[tuple[int, np.ndarray]]:
 
 
 def test_every_step_is_shown_and_each_end_stays_for_a_second(run_folder, tmp_path, monkeypatch):
-    # Right and left in turns: no two neighboring pictures are alike, unless the agent stands between walls.
+    # Right and left in turns: no two neighboring frames are alike, unless the agent stands between walls.
     turns = iter([2, 3] * 100)
     monkeypatch.setattr(PPO, "predict", lambda *args, **kwargs: (np.int64(next(turns)), None))
-    success = film(run_folder, tmp_path / "a.gif", n_episodes=2, seed=3)
-    shown = pictures(tmp_path / "a.gif")
+    success = record(run_folder, tmp_path / "a.gif", n_episodes=2, seed=3)
+    shown = frames(tmp_path / "a.gif")
     assert success in (0.0, 0.5, 1.0)
-    # Ten pictures for nine steps, with the run's own time limit; the last one stays.
+    # Ten frames for nine steps, with the run's own time limit; the last one stays.
     assert sum(duration for duration, _ in shown) == 2 * (10 + N_LAST - 1) * MILLISECONDS
     assert sum(duration >= N_LAST * MILLISECONDS for duration, _ in shown) == 2
 
 
-def test_of_a_long_episode_some_pictures_are_left_out(run_folder, tmp_path, monkeypatch):
-    monkeypatch.setattr(film_module, "MAX_PICTURES", 4)
-    film(run_folder, tmp_path / "a.gif", n_episodes=1)
+def test_of_a_long_episode_some_frames_are_left_out(run_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MAX_FRAMES", 4)
+    record(run_folder, tmp_path / "a.gif", n_episodes=1)
     # Every third of ten, the last among them.
-    assert sum(duration for duration, _ in pictures(tmp_path / "a.gif")) == (4 + N_LAST - 1) * MILLISECONDS
+    assert sum(duration for duration, _ in frames(tmp_path / "a.gif")) == (4 + N_LAST - 1) * MILLISECONDS
 
 
 def test_an_environment_that_knows_no_success(run_folder, tmp_path, monkeypatch):
@@ -69,14 +67,14 @@ def test_an_environment_that_knows_no_success(run_folder, tmp_path, monkeypatch)
 
     plain = gym.make
     monkeypatch.setattr(gym, "make", lambda *args, **kwargs: Silent(plain(*args, **kwargs)))
-    assert film(run_folder, tmp_path / "a.gif", n_episodes=1) == 0.0
+    assert record(run_folder, tmp_path / "a.gif", n_episodes=1) == 0.0
     assert (tmp_path / "a.gif").is_file()
 
 
-def test_the_same_seed_films_the_same(run_folder, tmp_path):
+def test_the_same_seed_records_the_same(run_folder, tmp_path):
     for name in "ab":
-        film(run_folder, tmp_path / name, n_episodes=1, seed=5)
-    film(run_folder, tmp_path / "c", n_episodes=1, seed=6)
+        record(run_folder, tmp_path / name, n_episodes=1, seed=5)
+    record(run_folder, tmp_path / "c", n_episodes=1, seed=6)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() != (tmp_path / "c").read_bytes()
 
 
@@ -87,7 +85,7 @@ def test_the_seed_is_that_of_the_actions_too(run_folder, tmp_path, monkeypatch):
         monkeypatch.setattr(
             PPO, "predict", lambda *a, numbers=numbers, **k: (numbers.append(float(th.rand(()))) or np.int64(0), None)
         )
-        film(run_folder, tmp_path / "a.gif", n_episodes=1, seed=seed)
+        record(run_folder, tmp_path / "a.gif", n_episodes=1, seed=seed)
     assert drawn[5][0] != drawn[6][0]
 
 
@@ -96,7 +94,7 @@ def test_the_seed_is_that_of_the_actions_too(run_folder, tmp_path, monkeypatch):
     [
         (["nowhere"], "nowhere is no run folder of rl-zoo3"),
         (["RUN", "--episodes", "0"], "n_episodes must be at least 1, got 0"),
-        (["RUN", "--gym-packages", "no_such_module"], "--gym-packages: cannot import 'no_such_module'"),
+        (["RUN", "--packages", "no_such_module"], "--packages: cannot import 'no_such_module'"),
     ],
 )
 def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message):
@@ -119,14 +117,14 @@ def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message)
         ({"normalize": "{'norm_obs': False}"}, None),
         ({"normalize": {"norm_obs": False}}, None),
         ({"normalize": "False"}, None),
-        ({"vec_env_wrapper": [{"sb3_abisim.rl.vec_encode.VecEncodeObservations": {"encoder": "e"}}]}, None),
+        ({"vec_env_wrapper": [{"sb3_abisim.VecEncodeObservations": {"encoder": "e"}}]}, None),
     ],
 )
 def test_wrappers_that_would_be_missing_are_named(run_folder, settings, named):
-    """A model would be shown other pictures, or act otherwise, than in training."""
-    run = dataclasses.replace(read_run(run_folder), settings=settings)
+    """A model would get other observations than in training."""
+    changed = dataclasses.replace(read_run(run_folder), settings=settings)
     with contextlib.nullcontext() if named is None else pytest.raises(ValueError, match=f"with {named}, which is not"):
-        final_model(run)
+        final_model(changed)
 
 
 def test_a_run_that_goes_on_is_refused(run_folder, tmp_path):
@@ -134,12 +132,12 @@ def test_a_run_that_goes_on_is_refused(run_folder, tmp_path):
     hidden = model.rename(tmp_path / "hidden.zip")
     try:
         with pytest.raises(ValueError, match=r"holds no final model \(Nav2D-v0.zip\); let the run end first"):
-            film(run_folder, tmp_path / "a.gif")
+            record(run_folder, tmp_path / "a.gif")
     finally:
         hidden.rename(model)
 
 
-def test_a_folder_that_is_not_there_is_told_before_filming(tmp_path, capsys):
+def test_a_missing_folder_is_reported_before_recording(tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         main([str(tmp_path / "run"), "-o", str(tmp_path / "absent" / "a.gif")])
     assert stopped.value.code == 2 and "there is no folder" in capsys.readouterr().err
@@ -150,22 +148,21 @@ def test_an_environment_in_a_namespace(tmp_path, monkeypatch, capsys):
     gym.register("toy/Grid-v0", entry_point=gym.spec("Nav2D-v0").entry_point, max_episode_steps=9)
     try:
         settings = "policy: CnnPolicy, n_timesteps: 64, n_envs: 2, n_steps: 32, batch_size: 32"
-        extractor = "dict(features_extractor_class=get_class_by_name('sb3_abisim.rl.extractors.VanillaExtractor'))"
-        (tmp_path / "own.yml").write_text(f'toy/Grid-v0: {{{settings}, policy_kwargs: "{extractor}"}}')
+        extractor = "{features_extractor_class: sb3_abisim.VanillaExtractor}"
+        (tmp_path / "custom.yml").write_text(f"toy/Grid-v0: {{{settings}, policy_kwargs: {extractor}}}")
         words = ["--algo", "ppo", "--env", "toy/Grid-v0", "-f", str(tmp_path / "logs"), "--eval-freq", "-1"]
-        monkeypatch.setattr("sys.argv", [])
-        zoo.main(["train", *words, "--conf-file", str(tmp_path / "own.yml"), "--num-threads", "1"])
-        run = tmp_path / "logs" / "ppo" / "toy-Grid-v0_1"
-        assert (read_run(run).env_id, read_run(run).env_name) == ("toy/Grid-v0", "toy-Grid-v0")
-        film(run, tmp_path / "a.gif", n_episodes=1)
-        benchmark(["evaluate", str(run), "--episodes", "2", "--gym-packages", "sb3_abisim"])
+        run(monkeypatch, "train", *words, "--conf-file", str(tmp_path / "custom.yml"), "--num-threads", "1")
+        folder = tmp_path / "logs" / "ppo" / "toy-Grid-v0_1"
+        assert (read_run(folder).env_id, read_run(folder).env_name) == ("toy/Grid-v0", "toy-Grid-v0")
+        record(folder, tmp_path / "a.gif", n_episodes=1)
+        benchmark(["evaluate", str(folder), "--episodes", "2", "--packages", "sb3_abisim"])
         (copied,) = find_runs(export(tmp_path / "logs", tmp_path / "copy"))
         assert copied.final()["stochastic/standard/results"].shape == (2,) and copied.command
     finally:
         del gym.registry["toy/Grid-v0"]
     with pytest.raises(SystemExit):
-        benchmark(["evaluate", str(run)])
+        benchmark(["evaluate", str(folder)])
     message = (
-        "was trained in toy/Grid-v0, which is not registered here; give the module that registers it with --gym-pack"
+        "was trained in toy/Grid-v0, which is not registered here; give the module that registers it with --packages"
     )
     assert message in capsys.readouterr().err

@@ -17,12 +17,12 @@ import numpy as np
 from tqdm import tqdm
 
 from sb3_abisim._version import __version__
-from sb3_abisim.benchmark.jobs.job import is_by_other_code, is_done, kill, launch, manifest_path
-from sb3_abisim.benchmark.plan import Job
+from sb3_abisim.benchmark.jobs.job import Job, is_by_other_code, is_done, manifest_path
+from sb3_abisim.benchmark.jobs.launch import kill, launch
 from sb3_abisim.common.files import folder_lock
 
 REFRESH_SECONDS = 1.0
-# Before anything has been measured: seconds per transition, update, step and episode.
+# Before anything has been measured: seconds for a cost of 1, that is a transition, an update, a step, an episode.
 _FIRST_GUESS = {"data": 2e-4, "encoder": 2e-2, "run": 1e-3, "final": 5e-2}
 _START_SECONDS = 5.0
 _N_NAMED = 5
@@ -37,7 +37,7 @@ class Engine(Protocol):
     n_slots: int
 
     def submit(self, root: Path, job: Job) -> "Future[None]":
-        """Run a job; the future raises :class:`~sb3_abisim.benchmark.jobs.job.CellError` when it fails."""
+        """Run a job; the future raises :class:`~sb3_abisim.benchmark.jobs.launch.JobError` when it fails."""
 
     def close(self) -> None:
         """Stop what runs, if anything does, and let go of all resources."""
@@ -59,7 +59,7 @@ class LocalEngine:
         self._lock, self._closed = threading.Lock(), False
 
     def submit(self, root: Path, job: Job) -> "Future[None]":
-        """Run a job in a program of its own."""
+        """Run a job in a separate program."""
         return self._pool.submit(launch, root, job.to_json(), self.threads, self._started)
 
     def _started(self, process: "subprocess.Popen[bytes]") -> None:
@@ -135,7 +135,7 @@ class _Run:
         if titles:
             names = ", ".join(titles[:_N_NAMED]) + (f" and {len(titles) - _N_NAMED} more" if titles[_N_NAMED:] else "")
             what = f"{len(titles)} of {len(self.jobs)} jobs were made by other code of version {__version__}"
-            print(f"warning: {what} and are kept: {names}; take another folder to make all anew", file=sys.stderr)
+            print(f"warning: {what} and are kept: {names}; take another folder to make all again", file=sys.stderr)
 
     def _submit_ready(self) -> None:
         for job in list(self.waiting):
@@ -188,7 +188,7 @@ class _Run:
 
 
 def _rate_name(job: Job) -> str:
-    """Jobs of one name take about equally long per unit."""
+    """Jobs of one name take about equally long for their cost."""
     source = job.inputs[0] if job.kind == "final" else job
     name = source.settings.get("objective", source.settings.get("algo", ""))
     return f"{job.kind} {source.settings['env_id']} {name}"

@@ -1,7 +1,7 @@
-"""Run the jobs of a benchmark on a Ray cluster: the same jobs, in programs of their own on its nodes.
+"""Run the jobs of a benchmark on a Ray cluster: the same jobs, in separate programs on its nodes.
 
 The benchmark's folder must be a shared one, at the same path on every node, and the nodes must have this version of the
-package. Ray starts a job anew, on another node, when it has lost the worker that ran it.
+package. Ray starts a job again, on another node, when it has lost the worker that ran it.
 """
 
 import logging
@@ -10,14 +10,12 @@ import socket
 import time
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sb3_abisim._version import __version__
-from sb3_abisim.benchmark.jobs.job import JobError, launch
+from sb3_abisim.benchmark.jobs.job import Job
+from sb3_abisim.benchmark.jobs.launch import JobError, launch
 from sb3_abisim.common.files import write_atomic
-
-if TYPE_CHECKING:
-    from sb3_abisim.benchmark.plan import Job  # at run time it would load PyTorch into each of Ray's workers
 
 
 class RayEngine:
@@ -27,7 +25,7 @@ class RayEngine:
     :param threads: of each job, which asks for as many processors
     :param address: of the cluster, ``host:port`` or "auto" for the one of this machine
     :param gpus: per job; a part of one is shared
-    :param retries: how often a job is started anew after a lost worker
+    :param retries: how often a job is started again after a lost worker
     :raises ValueError: if Ray is not installed, there is no cluster, or it has too little for one job
     """
 
@@ -56,7 +54,7 @@ class RayEngine:
         self.n_slots, self.threads = room if n_jobs is None else n_jobs, threads
         self._options = {"num_cpus": threads, "num_gpus": gpus, "max_retries": retries}
 
-    def submit(self, root: Path, job: "Job") -> "Future[None]":
+    def submit(self, root: Path, job: Job) -> "Future[None]":
         """Hand a job to the cluster."""
         root = root.resolve()
         token = root / "shared_folder"

@@ -1,4 +1,4 @@
-"""The pictures of a report."""
+"""The figures of a report."""
 
 import io
 import itertools
@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_abisim.benchmark.report.tables import Comparison, Group, Row
-from sb3_abisim.registry import methods
+from sb3_abisim.benchmark.report.groups import WITHOUT_SPLITS, Group
+from sb3_abisim.benchmark.report.tables import Comparison, Row
+from sb3_abisim.registry import get_traits, methods
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette, which color-blind readers can tell apart, and two more for whatever else is compared.
+# Okabe and Ito's palette, which color-blind readers can distinguish, and two more for whatever else is compared.
 PALETTE = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31", "#7F7F7F",
 )  # fmt: skip
 GRAY = "#6b7280"
 DPI = 150
 MINUS = "\N{MINUS SIGN}"
-SPLIT_NAMES = {"eval": "unseen clips", "train": "clips seen in training", "clean": "no clips"}
 _STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
@@ -50,10 +50,31 @@ def level_text(value: float) -> str:
     return f"{value:.4g}".replace("-", MINUS)
 
 
-def draw(comparison: Comparison) -> dict[str, bytes]:
-    """All pictures that the comparison has numbers for.
+def threshold_text(row: Row) -> str:
+    """A threshold as a reader sees it, with its return.
 
-    :param comparison: what to draw
+    :param row: of the table of thresholds
+    """
+    if isinstance(row["threshold"], str):
+        return f"the final return of {row['threshold']} ({level_text(row['return'])})"
+    return f"{100 * row['threshold']:g} % normalized return ({level_text(row['return'])})"
+
+
+def split_order(comparison: Comparison, env_id: str) -> list[str]:
+    """The splits that final models of an environment were evaluated on, the one for evaluation first.
+
+    :param comparison: with final evaluations
+    :param env_id: one of its environments
+    """
+    found = {row["split"] for row in comparison.final if row["env_id"] == env_id} - {*WITHOUT_SPLITS}
+    known = [split for split in get_traits(env_id).splits if split in found]
+    return known + sorted(found - {*known})
+
+
+def plot(comparison: Comparison) -> dict[str, bytes]:
+    """All figures that the comparison has numbers for.
+
+    :param comparison: what to plot
     :return: name without ending to PNG file
     """
     import matplotlib
@@ -61,10 +82,10 @@ def draw(comparison: Comparison) -> dict[str, bytes]:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    labels = list(dict.fromkeys(label for methods in comparison.groups.values() for label in methods))
+    labels = list(dict.fromkeys(label for groups in comparison.groups.values() for label in groups))
     labels.sort(key=lambda label: label != comparison.reference)
     colors = assign_colors(labels)
-    pictures = {}
+    images = {}
     functions = {
         "curves": _curves, "thresholds": _thresholds, "splits": _splits, "aggregates": _aggregates,
         "profiles": _profiles, "improvement": _improvement,
@@ -77,8 +98,8 @@ def draw(comparison: Comparison) -> dict[str, bytes]:
                 # Without it the file holds matplotlib's version, and equal reports would differ.
                 figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
                 plt.close(figure)
-                pictures[name] = buffer.getvalue()
-    return pictures
+                images[name] = buffer.getvalue()
+    return images
 
 
 def assign_colors(labels: Sequence[str]) -> dict[str, str]:
@@ -90,10 +111,10 @@ def assign_colors(labels: Sequence[str]) -> dict[str, str]:
     known = methods()
     names = [re.split("[=,]", label)[0] for label in labels]
     colors = {name: known[name].color for name in names if name in known}
-    own = {name: color for name, color in colors.items() if color is not None}
-    spare = itertools.cycle([color for color in PALETTE if color not in own.values()])
+    taken = {name: color for name, color in colors.items() if color is not None}
+    spare = itertools.cycle([color for color in PALETTE if color not in taken.values()])
     pairs = zip(labels, names, strict=True)
-    return {label: own.pop(method) if method in own else next(spare) for label, method in pairs}
+    return {label: taken.pop(name) if name in taken else next(spare) for label, name in pairs}
 
 
 def _curves(comparison: Comparison, colors: dict[str, str]) -> "Figure":
@@ -101,17 +122,16 @@ def _curves(comparison: Comparison, colors: dict[str, str]) -> "Figure":
 
     n = len(comparison.groups)
     figure, axes = plt.subplots(1, n, figsize=(max(6.4, 4.4 * n), 4.2), squeeze=False)
-    for axis, (env_id, methods) in zip(axes[0], comparison.groups.items(), strict=True):
+    for axis, (env_id, groups) in zip(axes[0], comparison.groups.items(), strict=True):
         # The reference last, so that it lies on top.
-        for label in reversed(methods):
+        for label in reversed(groups):
             rows = [row for row in comparison.curves if (row["env_id"], row["method"]) == (env_id, label)]
             steps, mean, low, high = (np.array([row[key] for row in rows]) for key in ("steps", "mean", "low", "high"))
             width = 2.4 if label == comparison.reference else 1.6
-            axis.plot(
-                steps, mean, color=colors[label], lw=width, label=label, manifest="o" if len(steps) == 1 else None
-            )
+            # A single evaluation makes no line.
+            axis.plot(steps, mean, "-o" if len(steps) == 1 else "-", color=colors[label], lw=width, label=label)
             axis.fill_between(steps, low, high, color=colors[label], alpha=0.18, lw=0)
-        _show_possible(axis, next(iter(methods.values())))
+        _show_possible(axis, next(iter(groups.values())))
         axis.set(title=env_id, xlabel="environment steps")
         axis.xaxis.set_major_formatter(_short_number)
         axis.locator_params(axis="x", nbins=5)
@@ -153,10 +173,7 @@ def _thresholds(comparison: Comparison, colors: dict[str, str]) -> "Figure | Non
         for y, row in enumerate(shown):
             _interval(axis, y, row["ratio"], row["low"], row["high"], colors[row["baseline"]], row["bound"])
         axis.axvline(1, color=GRAY, lw=1)
-        ends = [" (its end)" if row["threshold"] == row["baseline"] else "" for row in shown]
-        names = [
-            f"{row['baseline']}, return {level_text(row['return'])}{end}" for row, end in zip(shown, ends, strict=True)
-        ]
+        names = [f"{row['baseline']}, to {_short_threshold(row)}" for row in shown]
         axis.set_yticks(range(len(shown)), names)
         axis.set_xscale("log")
         axis.set_xlim(*_log_limits([row[key] for row in shown for key in ("ratio", "low", "high")]))
@@ -165,9 +182,16 @@ def _thresholds(comparison: Comparison, colors: dict[str, str]) -> "Figure | Non
         )
         axis.xaxis.set_major_formatter(_short_number)
         axis.xaxis.set_minor_formatter(lambda value, position: "")
-        axis.set(title=env_id, ylim=(len(shown) - 0.4, -0.6), xlabel=f"steps of {comparison.reference} / steps of it")
+        xlabel = f"steps of {comparison.reference} / steps of the baseline"
+        axis.set(title=env_id, ylim=(len(shown) - 0.4, -0.6), xlabel=xlabel)
         axis.grid(axis="y", visible=False)
     return figure
+
+
+def _short_threshold(row: Row) -> str:
+    if row["threshold"] == row["baseline"]:
+        return f"its final return ({level_text(row['return'])})"
+    return threshold_text(row).replace(" normalized return", "")
 
 
 def _log_limits(values: Sequence[float]) -> tuple[float, float]:
@@ -183,24 +207,26 @@ def _interval(axis: "Axes", y: float, value: float, low: float, high: float, col
 
 
 def _splits(comparison: Comparison, colors: dict[str, str]) -> "Figure | None":
-    rows = [row for row in comparison.final if row["split"] in SPLIT_NAMES and row["mode"] == "deterministic"]
-    if not rows:
+    orders = {env_id: split_order(comparison, env_id) for env_id in comparison.groups}
+    orders = {env_id: order for env_id, order in orders.items() if order}
+    if not orders:
         return None
     import matplotlib.pyplot as plt
 
-    env_ids = list(dict.fromkeys(row["env_id"] for row in rows))
-    figure, axes = plt.subplots(1, len(env_ids), figsize=(max(6.4, 5.6 * len(env_ids)), 4), squeeze=False)
-    for axis, env_id in zip(axes[0], env_ids, strict=True):
-        labels = [label for label in colors if any((r["env_id"], r["method"]) == (env_id, label) for r in rows)]
+    figure, axes = plt.subplots(1, len(orders), figsize=(max(6.4, 5.6 * len(orders)), 4), squeeze=False)
+    for axis, (env_id, order) in zip(axes[0], orders.items(), strict=True):
+        rows = [row for row in comparison.final if row["env_id"] == env_id and row["mode"] == "deterministic"]
+        rows = [row for row in rows if row["split"] in order]
+        labels = [label for label in colors if any(row["method"] == label for row in rows)]
         for i, label in enumerate(labels):
-            found = {r["split"]: r for r in rows if (r["env_id"], r["method"]) == (env_id, label)}
-            x = [list(SPLIT_NAMES).index(split) + 0.7 * ((i + 0.5) / len(labels) - 0.5) for split in found]
-            means, halves = ([r[key] for r in found.values()] for key in ("mean", "half_width"))
+            found = {row["split"]: row for row in rows if row["method"] == label}
+            x = [order.index(split) + 0.7 * ((i + 0.5) / len(labels) - 0.5) for split in found]
+            means, halves = ([row[key] for row in found.values()] for key in ("mean", "half_width"))
             axis.errorbar(x, means, yerr=np.nan_to_num(halves), fmt="o", ms=7, lw=2.5, color=colors[label], label=label)
-        for line in (0.5, 1.5):
-            axis.axvline(line, color="#e5e7eb", lw=1)
-        axis.set_xticks(range(3), list(SPLIT_NAMES.values()))
-        axis.set(title=env_id, ylabel="return of the final model", xlim=(-0.5, 2.5))
+        for k in range(1, len(order)):
+            axis.axvline(k - 0.5, color="#e5e7eb", lw=1)
+        axis.set_xticks(range(len(order)), order)
+        axis.set(title=env_id, ylabel="return of the final model", xlim=(-0.5, len(order) - 0.5))
         _show_possible(axis, comparison.groups[env_id][labels[0]])
         axis.grid(axis="x", visible=False)
         axis.legend(loc="best")

@@ -11,13 +11,14 @@ from typing import Any
 
 from sb3_abisim._version import __version__
 from sb3_abisim.benchmark.report import statistics
-from sb3_abisim.benchmark.report.figures import MINUS, SPLIT_NAMES, draw, level_text
-from sb3_abisim.benchmark.report.tables import Comparison, Row, compare, split_label
+from sb3_abisim.benchmark.report.figures import MINUS, plot, split_order, threshold_text
+from sb3_abisim.benchmark.report.groups import WITHOUT_SPLITS, Group, split_label
+from sb3_abisim.benchmark.report.tables import Comparison, Row, compare
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_traits, methods
 from sb3_abisim.zoo.runs import Run, is_deterministic
 
-# Each a table, a picture or both, where there are numbers for it.
+# Each a table, a figure or both, where there are numbers for it.
 PARTS = ("curves", "final", "thresholds", "splits", "aggregates", "profiles", "improvement")
 BOUND_SIGNS = {"": "", "<=": "≤ ", ">=": "≥ ", "~": "≈ "}
 
@@ -37,17 +38,17 @@ def report(
     :param source: "evaluations" or "training"
     :param reference: label of the method that the others are compared with; None takes abisim (or
         abisim,frozen), else the first
-    :param thresholds: normalized returns, or methods whose last return is meant; None for the usual ones
+    :param thresholds: normalized returns, or methods for their final return; None for the usual ones
     :param seed: of the bootstrap
     :return: the page
     :raises ValueError: if the runs cannot be compared
     """
     folder = Path(output) if output is not None else Path(split_label(folders[0])[1]) / "report"
     comparison = compare(folders, source, reference, thresholds, seed)
-    pictures = draw(comparison)
-    page = render(comparison, pictures)
+    images = plot(comparison)
+    page = render(comparison, images)
     folder.mkdir(parents=True, exist_ok=True)
-    files = {f"{name}.png": picture for name, picture in pictures.items()}
+    files = {f"{name}.png": image for name, image in images.items()}
     for name in PARTS:
         rows = getattr(comparison, name, None)
         if rows:
@@ -69,11 +70,11 @@ def _csv(rows: list[Row]) -> bytes:
     return text.getvalue().encode()
 
 
-def render(comparison: Comparison, pictures: dict[str, bytes]) -> str:
+def render(comparison: Comparison, images: dict[str, bytes]) -> str:
     """The page.
 
     :param comparison: its numbers
-    :param pictures: name to PNG file
+    :param images: name to PNG file
     """
     import jinja2
 
@@ -82,29 +83,29 @@ def render(comparison: Comparison, pictures: dict[str, bytes]) -> str:
     )
     environment.filters |= {
         "number": _number,
-        "level": level_text,
+        "threshold": threshold_text,
         "place": _place,
         "plus_minus": _plus_minus,
         "ratio": _ratio,
     }
     template = environment.from_string(resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
-    images = {name: f"data:image/png;base64,{base64.b64encode(data).decode()}" for name, data in pictures.items()}
+    sources = {name: f"data:image/png;base64,{base64.b64encode(data).decode()}" for name, data in images.items()}
     labels = list(dict.fromkeys(label for group in comparison.groups.values() for label in group))
     known, names = methods(), [label.removesuffix(",frozen") for label in labels]
     unreached = _unreached(comparison)
     unreached_keys = {(row["env_id"], row["threshold"]) for row in unreached}
     return template.render(
         comparison=comparison,
-        images=images,
+        images=sources,
         cards=[_card(comparison, env_id) for env_id in comparison.groups],
         thresholds=[row for row in comparison.thresholds if (row["env_id"], row["threshold"]) not in unreached_keys],
         unreached=unreached,
         final=_final_table(comparison),
         splits=_split_table(comparison),
-        split_names=SPLIT_NAMES,
+        split_names=list(dict.fromkeys(s for env_id in comparison.groups for s in split_order(comparison, env_id))),
         names={label: known[name].label if name in known else "" for label, name in zip(labels, names, strict=True)},
         acting=_acting(comparison),
-        unseen=_on_unseen_clips(comparison),
+        on_eval_split=_on_eval_split(comparison),
         window=statistics.WINDOW,
         n_resamples=statistics.N_RESAMPLES,
         version=__version__,
@@ -114,33 +115,33 @@ def render(comparison: Comparison, pictures: dict[str, bytes]) -> str:
 def _acting(comparison: Comparison) -> str:
     """How the agents acted where the learning curves come from."""
     if comparison.source == "training":
-        return (
-            "Learning curves show the training episodes themselves, in which the agent explores: actions are sampled."
-        )
+        return "Learning curves show the training episodes themselves, in which the policy is stochastic: it explores."
     states = {env_id: is_deterministic(env_id) for env_id in comparison.groups}
     if all(states.values()):
-        text = "Evaluation is deterministic: the agent takes its most likely action."
+        text = "Evaluation during training is deterministic."
     else:
-        names = {True: "deterministic", False: "with sampled actions", None: "of unknown kind (not registered here)"}
-        text = f"Evaluation is {', '.join(f'{names[state]} in {env_id}' for env_id, state in states.items())}."
+        names = {True: "deterministic", False: "stochastic", None: "of unknown kind (not registered here)"}
+        parts = ", ".join(f"{names[state]} in {env_id}" for env_id, state in states.items())
+        text = f"Evaluation during training is {parts}."
     counts = sorted({run.n_eval_episodes for _, group in _groups(comparison) for run in group.runs})
     return f"{text} Each evaluation is the mean of {' or '.join(map(str, counts))} episodes."
 
 
-def _on_unseen_clips(comparison: Comparison) -> bool:
-    """Whether there are Distractor environments, evaluated by the zoo on other clips than those of training."""
+def _on_eval_split(comparison: Comparison) -> bool:
+    """Whether there are environments with splits, evaluated by the zoo on another one than that of training."""
     runs = [run for _, group in _groups(comparison) for run in group.runs if get_traits(run.env_id).splits]
-    given = [run.settings.get("eval_env_kwargs") or {} for run in runs]
-    return bool(runs) and not any(kwargs.keys() & {"split", "clips"} for kwargs in given)
+    return bool(runs) and not any(
+        (run.settings.get("eval_env_kwargs") or {}).keys() & {*get_traits(run.env_id).split_kwargs} for run in runs
+    )
 
 
-def _groups(comparison: Comparison) -> list[tuple[str, Any]]:
-    return [(env_id, group) for env_id, methods in comparison.groups.items() for group in methods.values()]
+def _groups(comparison: Comparison) -> list[tuple[str, Group]]:
+    return [(env_id, group) for env_id, groups in comparison.groups.items() for group in groups.values()]
 
 
 def _card(comparison: Comparison, env_id: str) -> dict[str, Any]:
-    """What a reader in a hurry takes away: how soon the reference is where a baseline ends, and how soon it reaches the
-    highest return that all its runs reached, against each baseline."""
+    """What a reader in a hurry takes away: how soon the reference reaches the final return of a baseline, and how soon
+    it reaches the highest threshold that all its runs reached, compared with each baseline."""
     rows = [row for row in comparison.thresholds if row["env_id"] == env_id]
     always = [row for row in rows if row["reached_reference"] == row["n_reference"]]
     parts = {row["threshold"]: [row] for row in rows if row["threshold"] == row["baseline"]}
@@ -151,19 +152,12 @@ def _card(comparison: Comparison, env_id: str) -> dict[str, Any]:
     return {
         "env_id": env_id,
         "n_runs": f"{min(counts)} to {max(counts)}" if len(counts) > 1 else str(min(counts)),
-        "parts": [
-            {
-                "ends": threshold if isinstance(threshold, str) else "",
-                "level": found[0]["return"],
-                "lines": [_sentence(row) for row in found],
-            }
-            for threshold, found in parts.items()
-        ],
+        "parts": [{"row": found[0], "lines": [_sentence(row) for row in found]} for found in parts.values()],
     }
 
 
 def _unreached(comparison: Comparison) -> list[Row]:
-    """One row for each environment and threshold at which no run of any method arrived."""
+    """One row for each environment and threshold that no run of any method reached."""
     rows: dict[tuple[str, Any], list[Row]] = {}
     for row in comparison.thresholds:
         rows.setdefault((row["env_id"], row["threshold"]), []).append(row)
@@ -172,15 +166,15 @@ def _unreached(comparison: Comparison) -> list[Row]:
 
 def _sentence(row: Row) -> str:
     if not math.isfinite(row["ratio"]):
-        return f"{row['baseline']}: none arrived"
+        return f"{row['baseline']}: no run reached it"
     return f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f} times the steps of {row['baseline']}: {_verdict(row)}"
 
 
 def _verdict(row: Row) -> str:
     if not math.isfinite(row["low"]):
         return "one run, no interval"
-    # Where the baseline did not always arrive, the true ratio is smaller than the interval says; where the reference
-    # did not, larger.
+    # Where runs of the baseline are censored, the true ratio is smaller than the interval says; where runs of the
+    # reference are, larger.
     if row["high"] < 1 and row["bound"] in ("", "<="):
         return "fewer"
     if row["low"] > 1 and row["bound"] in ("", ">="):
@@ -189,15 +183,14 @@ def _verdict(row: Row) -> str:
 
 
 def _final_table(comparison: Comparison) -> list[dict[str, Any]]:
-    """One row per environment and method, with both ways of acting side by side; unseen clips where there are clips."""
+    """One row per environment and method, with both modes side by side; the eval split where there are splits."""
     table: dict[tuple[str, str], dict[str, Any]] = {}
     for row in comparison.final:
-        if row["split"] in ("train", "clean"):
+        if row["split"] in split_order(comparison, row["env_id"])[1:]:
             continue
         key = (row["env_id"], row["method"])
         entry = table.setdefault(key, {"env_id": key[0], "method": key[1], "n_runs": row["n_runs"], "paper": None})
         entry[row["mode"]] = (row["mean"], row["half_width"])
-        entry["where"] = row["split"]
         if row["paper"] is not None:
             entry["paper"] = (row["paper"], row["paper_plus_minus"])
     return list(table.values())
@@ -206,7 +199,7 @@ def _final_table(comparison: Comparison) -> list[dict[str, Any]]:
 def _split_table(comparison: Comparison) -> list[dict[str, Any]]:
     table: dict[tuple[str, str, str], dict[str, Any]] = {}
     for row in comparison.final:
-        if row["split"] in SPLIT_NAMES:
+        if row["split"] not in WITHOUT_SPLITS:
             key = (row["env_id"], row["method"], row["mode"])
             entry = table.setdefault(key, dict(zip(("env_id", "method", "mode"), key, strict=True)))
             entry[row["split"]] = (row["mean"], row["half_width"])
@@ -232,6 +225,6 @@ def _plus_minus(pair: tuple[float, float] | None) -> str:
 
 def _ratio(row: Row) -> str:
     if not math.isfinite(row["ratio"]):
-        return "none arrived"
+        return "not reached"
     text = f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f}"
     return f"{text} [{row['low']:.2f}, {row['high']:.2f}]" if math.isfinite(row["low"]) else text

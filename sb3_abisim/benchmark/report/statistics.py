@@ -32,7 +32,7 @@ def mean_and_interval(values: Floats) -> tuple[Floats, Floats]:
 
 
 def on_common_steps(curves: list[tuple[NDArray[np.int64], Floats]]) -> tuple[NDArray[np.int64], Floats]:
-    """Curves with steps of their own, in straight lines between them, on the steps that all of them cover.
+    """Curves with different steps, interpolated linearly, on the steps that all of them cover.
 
     :param curves: (steps, values) of each run, both of shape (n,)
     :return: steps, shape (m,), and values, shape (n_runs, m)
@@ -66,13 +66,13 @@ def steps_to_threshold(steps: NDArray[np.int64], values: Floats, threshold: floa
 class Ratio:
     """How many steps one method needs for each step of another.
 
-    :param value: ratio of the mean steps; runs that never arrived count with their method's horizon, or, where runs of
-        both did not, with the shorter of the two
+    :param value: ratio of the mean steps; censored runs, which did not reach the threshold, count with their method's
+        horizon, or, where runs of both are censored, with the shorter of the two
     :param low: of the 95 % interval; NaN with a single run
     :param high: of the interval
-    :param bound: "" when all runs arrived; "<=" when runs of the baseline alone did not, so that the true ratio is
-        smaller; ">=" when runs of the reference alone did not; "~" when runs of both did not
-    :param reached: share of the runs that arrived, of the reference and of the baseline
+    :param bound: "" when no run is censored; "<=" when runs of the baseline alone are, so that the true ratio is
+        smaller; ">=" when runs of the reference alone are; "~" when runs of both are
+    :param reached: share of the runs that reached the threshold, of the reference and of the baseline
     :param steps: the mean steps of the reference and of the baseline
     """
 
@@ -87,18 +87,18 @@ class Ratio:
 def steps_ratio(reference: Floats, baseline: Floats, horizons: tuple[int, int], seed: int = 0) -> Ratio:
     """Compare steps to a threshold; the interval is a percentile bootstrap over the runs of both.
 
-    :param reference: steps of each run, NaN where it never arrived
+    :param reference: steps of each run, NaN where it is censored
     :param baseline: likewise
     :param horizons: how long the runs of the reference and of the baseline are
     :param seed: of the resamples
     """
-    missed = bool(np.isnan(reference).any()), bool(np.isnan(baseline).any())
-    bound = {(False, False): "", (False, True): "<=", (True, False): ">=", (True, True): "~"}[missed]
+    censored = bool(np.isnan(reference).any()), bool(np.isnan(baseline).any())
+    bound = {(False, False): "", (False, True): "<=", (True, False): ">=", (True, True): "~"}[censored]
     reached = float(1 - np.isnan(reference).mean()), float(1 - np.isnan(baseline).mean())
     if not any(reached):
         return Ratio(float("nan"), float("nan"), float("nan"), bound, reached, horizons)
-    # Where one arrives, longer runs of the other make a closer bound; where neither does, they feign a difference.
-    limits = (min(horizons),) * 2 if all(missed) else horizons
+    # Longer censored runs of one method make a closer bound; where runs of both are censored, they feign a difference.
+    limits = (min(horizons),) * 2 if all(censored) else horizons
     a, b = (
         np.minimum(np.nan_to_num(steps, nan=limit), limit)
         for steps, limit in zip((reference, baseline), limits, strict=True)
@@ -126,7 +126,7 @@ def area_under_curve(steps: NDArray[np.int64], values: Floats) -> Floats:
 
 @contextlib.contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """Seed NumPy's global generator for a block and put it back: rliable 1.2 draws from it whatever it is told.
+    """Seed NumPy's global generator for a block and restore it: rliable 1.2 samples from it whatever it is given.
 
     :param seed: of the block
     """

@@ -1,7 +1,7 @@
 """Lossless exchange with Minari.
 
-Pictures are stored without JPEG. Whatever a Minari dataset says about its environment is only copied as text: nothing
-here makes an environment, because opening one described by a stranger's file can run the stranger's code.
+Observations are stored without JPEG. What a Minari dataset says about its environment is only copied as text. Nothing
+here makes an environment, because to open one that a stranger's file describes can run the stranger's code.
 """
 
 import hashlib
@@ -20,15 +20,15 @@ from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import (
     CONTENT_HASH_KEY,
     CUT,
-    DRAWN_FORMAT_VERSION,
     FORMAT_VERSION,
     IDENTITY_KEYS,
+    RENDERED_FORMAT_VERSION,
     TERMINATED,
     TRUNCATED,
     check_factor_layout,
     check_spaces,
 )
-from sb3_abisim.data.writer import Segment, check_folder, open_writer
+from sb3_abisim.data.writer import Segment, check_folder, fit_actions, write_segments
 from sb3_abisim.registry import register_reader
 
 # The key of our block in a Minari dataset's metadata.
@@ -36,8 +36,6 @@ METADATA_KEY = "sb3_abisim"
 # Infos of an exported episode: true on the last row of a segment that ended because its shard did.
 CUT_KEY = "cut_by_shard_end"
 FACTORS_KEY = "factors"
-SHARD_TRANSITIONS = 8192
-SHARD_BYTES = 2**27
 
 
 def export_dataset(folder: str | Path, dataset_id: str) -> None:
@@ -54,8 +52,9 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
     minari = _import_minari()
     _check_id(dataset_id)
     dataset = TransitionDataset(folder)
-    source = dataset.meta["source"] or {}
-    channels_last = bool(source.get("channels_last"))
+    source = dataset.meta["source"]
+    # What else has written it may say of its source whatever it likes.
+    channels_last = isinstance(source, dict) and bool(source.get("channels_last"))
     space = dataset.observation_space
     if channels_last:
         space = _move_channels(space, 0, -1)
@@ -69,7 +68,7 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
             action_space=dataset.action_space,
             algorithm_name=f"{dataset.meta['policy']} policy",
             description=f"Transitions of {dataset.env_id}, made by sb3_abisim. Rewards were not recorded: all are 0.",
-            # True, the default, stores pictures of 32 x 32 and more as JPEG, which alters them.
+            # True, the default, stores observations of 32 x 32 and more as JPEG, which alters them.
             jpeg_encoding=False,
         )
     content = hashlib.sha256()
@@ -91,17 +90,19 @@ def _check_id(dataset_id: str) -> None:
     try:
         parse_dataset_id(dataset_id)
     except (ValueError, TypeError):  # TypeError without a version
-        raise ValueError(f"{dataset_id!r} is no name of a Minari dataset; give one such as nav2d/random-v0") from None
+        raise ValueError(
+            f"{dataset_id!r} is not a name of a Minari dataset; give one such as nav2d/random-v0"
+        ) from None
 
 
 def import_dataset(dataset_id: str, folder: str | Path) -> str:
     """Make a dataset folder from Minari's local store; rewards are dropped.
 
-    Observations must be uint8 pictures (channels first or last) and actions ``Discrete`` or a float32 ``Box``.
+    Observations must be uint8 images (channels first or last) and actions ``Discrete`` or a float32 ``Box``.
 
     :param dataset_id: of a dataset that is already in the local store
     :param folder: new or empty
-    :return: the digest of the new dataset
+    :return: the hash of the new dataset
     :raises ValueError: if there is no such dataset, or it does not fit
     :raises ImportError: without Minari, naming the command that installs it
     """
@@ -111,27 +112,25 @@ def import_dataset(dataset_id: str, folder: str | Path) -> str:
     storage, metadata = _open_storage(dataset_id)
     identity = _identity(dataset_id, storage, metadata)
     channels_last = identity["source"]["channels_last"]
-    with open_writer(folder, identity) as writer:
-        if writer.is_finished:
-            raise ValueError(f"{folder} already holds this dataset; name a new folder, or remove it to import it again")
-        n_shards, content = 0, hashlib.sha256()
-        episodes = storage.get_episodes(range(storage.total_episodes))
-        for group in _grouped(_hashed((_segment(e, identity, channels_last) for e in episodes), content)):
-            writer.write_shard(n_shards, group)
-            n_shards += 1
-        if not n_shards:
-            raise ValueError(f"Minari dataset {dataset_id} has no episodes; {_again(dataset_id)}")
-        expected = metadata.get(METADATA_KEY, {}).get("content_sha256", content.hexdigest())
-        if content.hexdigest() != expected:
-            what = (
-                f"Minari dataset {dataset_id} is damaged, was changed since its export or was not exported to its end"
-            )
-            raise ValueError(f"{what}; {_again(dataset_id)}")
-        return writer.finish(n_shards)
+    episodes = storage.get_episodes(range(storage.total_episodes))
+    segments = (_segment(episode, identity, channels_last) for episode in episodes)
+    return write_segments(folder, _verified(segments, dataset_id, metadata), identity)
 
 
-def _again(dataset_id: str) -> str:
-    return f"remove it with `minari delete {dataset_id}` and export it again"
+def _verified(segments: Iterable[Segment], dataset_id: str, metadata: dict[str, Any]) -> Iterator[Segment]:
+    """Pass segments on, and after the last one compare their content with what our export has recorded."""
+    content, again = hashlib.sha256(), f"remove it with `minari delete {dataset_id}` and export it again"
+    n_segments = 0
+    for segment in _hashed(segments, content):
+        yield segment
+        n_segments += 1
+    if not n_segments:
+        raise ValueError(f"Minari dataset {dataset_id} has no episodes; {again}")
+    if metadata.get(METADATA_KEY, {}).get("content_sha256", content.hexdigest()) != content.hexdigest():
+        raise ValueError(
+            f"Minari dataset {dataset_id} is damaged, was changed since its export or was not exported to its end; "
+            f"{again}"
+        )
 
 
 def _import_minari() -> Any:
@@ -205,7 +204,7 @@ def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[s
     shape = observation_space.shape or ()
     if not isinstance(observation_space, spaces.Box) or observation_space.dtype != np.uint8 or len(shape) != 3:
         raise ValueError(
-            f"Minari dataset {dataset_id} has observations {observation_space}; only uint8 pictures can be imported"
+            f"Minari dataset {dataset_id} has observations {observation_space}; only uint8 images can be imported"
         )
     channels_last = not is_channels_first(shape)
     if channels_last:
@@ -214,7 +213,7 @@ def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[s
         observation_space = _move_channels(observation_space, -1, 0)
     check_spaces(observation_space, storage.action_space)
     if storage.jpeg_encoding and _is_jpeg(storage.observation_space):
-        warnings.warn(f"Minari dataset {dataset_id} holds JPEG pictures: not what the environment showed", stacklevel=3)
+        warnings.warn(f"Minari dataset {dataset_id} holds JPEG images: not what the environment showed", stacklevel=3)
     source = {"minari": dataset_id, "channels_last": channels_last}
     identity = {
         "format_version": FORMAT_VERSION,
@@ -234,7 +233,7 @@ def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[s
         if (
             not isinstance(ours, dict)
             or not set(IDENTITY_KEYS) <= ours.keys()
-            or ours["format_version"] not in (FORMAT_VERSION, DRAWN_FORMAT_VERSION)
+            or ours["format_version"] not in (FORMAT_VERSION, RENDERED_FORMAT_VERSION)
         ):
             raise ValueError(f"Minari dataset {dataset_id} was exported by another version of sb3_abisim")
         check_factor_layout(ours["factors"])
@@ -279,7 +278,8 @@ def _segment(episode: dict[str, Any], identity: dict[str, Any], channels_last: b
         end = CUT
     factors = {name: _factor(infos, name, layout, where) for name, layout in identity["factors"].items()}
     frames = np.moveaxis(observations, -1, 1) if channels_last else observations
-    return Segment(frames, _actions(episode["actions"], identity, where), end, factors)
+    actions = fit_actions(episode["actions"], space_from_json(identity["action_space"]), where)
+    return Segment(frames, actions, end, factors)
 
 
 def _factor(infos: dict[str, Any], name: str, layout: dict[str, Any], where: str) -> NDArray[Any]:
@@ -287,35 +287,6 @@ def _factor(infos: dict[str, Any], name: str, layout: dict[str, Any], where: str
         return np.asarray(infos[FACTORS_KEY][name], dtype=layout["dtype"])
     except (KeyError, TypeError):
         raise ValueError(f"{where} lacks factor {name!r} that the dataset's metadata announces") from None
-
-
-def _actions(actions: Any, identity: dict[str, Any], where: str) -> NDArray[Any]:
-    space, array = space_from_json(identity["action_space"]), np.asarray(actions)
-    if isinstance(space, spaces.Discrete):
-        array = array.reshape(len(array)) if array.size == len(array) else array
-        low, high = space.start, space.start + space.n - 1
-        fits = array.dtype.kind in "iu" and array.ndim == 1
-    else:
-        low, high = space.low, space.high  # type: ignore[assignment]
-        fits = array.dtype == np.float32 and array.shape[1:] == space.shape
-    if not fits or not ((array >= low) & (array <= high)).all():
-        raise ValueError(f"{where} has actions ({array.dtype}, {array.shape}) that are not in its action space {space}")
-    return array.astype(np.int64) if isinstance(space, spaces.Discrete) else array
-
-
-def _grouped(segments: Iterable[Segment]) -> Iterator[list[Segment]]:
-    """Segments in groups of the size of a shard."""
-    group: list[Segment] = []
-    n_transitions = n_bytes = 0
-    for segment in segments:
-        group.append(segment)
-        n_transitions += len(segment.actions)
-        n_bytes += np.asarray(segment.frames).nbytes
-        if n_transitions >= SHARD_TRANSITIONS or n_bytes >= SHARD_BYTES:
-            yield group
-            group, n_transitions, n_bytes = [], 0, 0
-    if group:
-        yield group
 
 
 register_reader("minari", import_dataset, help="the id of a dataset in Minari's local store")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 SIZE = 64
 FRAME_SHAPE = (3, SIZE, SIZE)
 SPLITS = ("train", "eval")
-# A clip of a user's own keeps its file open, of which a process may have 256 on macOS.
+# A custom clip keeps its file open, of which a process may have 256 on macOS.
 MAX_OPEN_CLIPS = 200
 
 
@@ -21,9 +21,9 @@ class Clip:
     """A sequence of background frames, loaded when first shown.
 
     :param name: unique among the clips of a source
-    :param group: clips of one film or photograph share their group, and a group lies on one side of the split
+    :param group: clips of one video or photograph share their group, and a group lies on one side of the split
     :param length: number of frames, at least 2
-    :param digest: sha256 of the frames' bytes, in hexadecimal
+    :param hash: sha256 of the frames' bytes, in hexadecimal
     :param load: returns the frames, uint8 (length, 3, 64, 64), RGB
     """
 
@@ -35,14 +35,14 @@ class Clip:
 
     @property
     def clip_id(self) -> int:
-        """A number that names the content, whatever split or selection the clip is found in; 0 <= id < 2**60."""
+        """A number that stands for the content, in whatever split or selection the clip is found; 0 <= id < 2**60."""
         return int(self.hash[:15], 16)
 
 
 class Backgrounds:
     """Clips of one side of the split, with frames fetched by (clip, frame).
 
-    :param source: where the clips come from, for reports: "photo_pan" or a path
+    :param source: where the clips come from, for messages: "photo_pan" or a path
     :param split: "train" or "eval"
     :param clips: at least one
     """
@@ -55,7 +55,7 @@ class Backgrounds:
         self.names = tuple(clip.name for clip in clips)
         self.lengths = np.array([clip.length for clip in clips], dtype=np.int64)
         self.clip_ids = np.array([clip.clip_id for clip in clips], dtype=np.int64)
-        # Of clips that were shown, the last ones at the end.
+        # Of clips that were shown, the latest ones at the end.
         self._arrays: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
         self._selected: dict[tuple[str, ...], Backgrounds] = {}
 
@@ -66,7 +66,7 @@ class Backgrounds:
 
     @property
     def content_hash(self) -> str:
-        """sha256 over the clips in their order and the frame's shape; it changes when one pixel of a clip does."""
+        """sha256 over the clips in their order and the shape of a frame; one pixel of a clip changes it."""
         content = [list(FRAME_SHAPE), [[clip.name, clip.length, clip.hash] for clip in self.clips]]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
@@ -102,13 +102,13 @@ class Backgrounds:
         return np.where(phase <= last, phase, 2 * last - phase)
 
     def frames(self, clip: NDArray[np.int64], frame: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Background pictures in a new array.
+        """Frames of clips in a new array.
 
         :param clip: indices of clips, shape (m,)
         :param frame: shape (m,), at least 0; folded at the clips' ends
         :return: uint8 (m, 3, 64, 64)
         """
-        pictures = np.empty((len(clip), *FRAME_SHAPE), dtype=np.uint8)
+        frames = np.empty((len(clip), *FRAME_SHAPE), dtype=np.uint8)
         rows = zip(clip.tolist(), self.fold(clip, frame).tolist(), strict=True)
         for i, (c, f) in enumerate(rows):
             if c not in self._arrays:
@@ -116,8 +116,8 @@ class Backgrounds:
                 if len(self._arrays) > MAX_OPEN_CLIPS:
                     self._arrays.popitem(last=False)
             self._arrays.move_to_end(c)
-            pictures[i] = self._arrays[c][f]
-        return pictures
+            frames[i] = self._arrays[c][f]
+        return frames
 
     def _load(self, index: int) -> NDArray[np.uint8]:
         clip = self.clips[index]
@@ -127,7 +127,7 @@ class Backgrounds:
 
 
 def split_groups(groups: Iterable[str], seed: int, eval_fraction: float) -> tuple[set[str], set[str]]:
-    """Divide groups by their rank under a hash of seed and name, so that the machine and the order do not matter.
+    """Divide groups by the rank of a hash of seed and name, so that neither the machine nor their order matters.
 
     :param groups: at least two different names
     :param seed: another seed gives another split

@@ -1,7 +1,7 @@
-"""Other appearances of moving backgrounds.
+"""Color jitter of moving backgrounds, which train episodes have.
 
 A few clips have a few colors, and an encoder that has seen no others takes a saturated background for an agent that
-has moved (docs/figures.md). In training, each episode therefore shows its clip in a look of its own.
+has moved (docs/figures.md). Each train episode therefore shows its clip with another color jitter.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class ColorJitter:
-    """A look for each environment: mirrored or not, the channels exchanged, each over another range.
+    """A jitter for each environment: mirrored or not, the channels exchanged, each over another range.
 
     Integer arithmetic only: the same bytes on every machine.
 
@@ -23,8 +23,8 @@ class ColorJitter:
         self._first = np.zeros((n_envs, 3, 1, 1), dtype=np.uint16)
         self._last = np.full((n_envs, 3, 1, 1), 256, dtype=np.uint16)
 
-    def draw(self, index: int, generator: np.random.Generator) -> None:
-        """A new look for environment ``index``; half of the looks keep the range of each channel.
+    def sample(self, index: int, generator: np.random.Generator) -> None:
+        """Sample a new jitter for environment ``index``; half of them keep the range of each channel.
 
         :param index: of the environment
         :param generator: of the episode
@@ -35,19 +35,19 @@ class ColorJitter:
         keeps_range = generator.random() < 0.5
         self._first[index], self._last[index] = (0, 256) if keeps_range else (first, last)
 
-    def apply(self, pictures: NDArray[np.uint8], indices: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Pictures as they look in their environments.
+    def apply(self, frames: NDArray[np.uint8], indices: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Frames with the jitter of their environments.
 
-        :param pictures: uint8 (m, 3, height, width)
+        :param frames: uint8 (m, 3, height, width)
         :param indices: of environments, shape (m,)
         :return: a new array of the same shape
         """
-        turned = np.empty_like(pictures)
+        turned = np.empty_like(frames)
         rows = zip(self._channels[indices].tolist(), self._flips[indices].tolist(), strict=True)
         for i, (channels, (vertical, horizontal)) in enumerate(rows):
             for shown, channel in enumerate(channels):
-                turned[i, shown] = pictures[i, channel, ::vertical, ::horizontal]
+                turned[i, shown] = frames[i, channel, ::vertical, ::horizontal]
         first, last = self._first[indices], self._last[indices]
-        # Where a range is turned round, both products wrap at 2^16, and their sum is right again.
-        changed: NDArray[np.uint8] = ((turned * (last - first) + np.uint16(256) * first) >> 8).astype(np.uint8)
-        return changed
+        # Where a range is inverted, both products wrap at 2^16, and their sum is right again.
+        jittered: NDArray[np.uint8] = ((turned * (last - first) + np.uint16(256) * first) >> 8).astype(np.uint8)
+        return jittered

@@ -1,4 +1,4 @@
-"""The clips of a source: the built-in ones, or a user's own videos."""
+"""The clips of a source: the built-in ones, or custom videos."""
 
 import os
 from pathlib import Path
@@ -19,11 +19,11 @@ def load_backgrounds(
 ) -> Backgrounds:
     """The clips of one side of the split; loaded once per process and shared.
 
-    The keyword arguments apply to a user's own videos; the built-in clips have a fixed split.
+    The keyword arguments apply to custom videos; the built-in clips have a fixed split.
 
     :param source: folder of videos, of folders of frames, or a DAVIS root; None for the built-in ``photo_pan``
     :param split: "train" or "eval"
-    :param seed: of the split, where the folder does not bring its own
+    :param seed: of the split, where the folder does not define one
     :param eval_fraction: share of the groups that go to "eval", 0..1, at least one group on each side
     :param min_frames: shortest clip accepted, at least 2
     :param max_bytes: most memory the decoded frames of this side may take, 12,288 bytes a frame
@@ -41,11 +41,8 @@ def load_backgrounds(
         raise ValueError(f"min_frames must be at least 2, got {min_frames}")
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error must be 'raise' or 'skip', got {on_error!r}")
-    from sb3_abisim.envs.backgrounds import video, video_files
+    from sb3_abisim.envs.backgrounds import video_cache, video_files
 
     sources = video_files.find_sources(Path(source))
     chosen = video_files.split_sources(sources, seed, eval_fraction)
-    return video.load_split(str(source), split, chosen["train"], chosen["eval"], min_frames, max_bytes, on_error)
-
-
-# The built-in clips.
+    return video_cache.load_split(str(source), split, chosen["train"], chosen["eval"], min_frames, max_bytes, on_error)

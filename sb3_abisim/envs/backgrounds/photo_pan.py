@@ -1,7 +1,7 @@
 """The built-in clips, ``photo_pan``: a camera that pans and zooms over photographs, and two shots of a city.
 
-They need NumPy alone and integer arithmetic only, so that they have the same bytes on every machine; each clip is
-compared with the sha256 of its manifest when it is first shown.
+They need NumPy alone and integer arithmetic only, so that they have the same bytes on every machine. Each clip is
+compared with the hash in the manifest when it is first shown.
 """
 
 import json

@@ -1,6 +1,6 @@
-"""Finding a user's videos in a folder, and dividing them into a train and an eval side.
+"""Finding custom videos in a folder, and dividing them into a train and an eval side.
 
-A folder may hold video files and folders of frames at any depth, or be a DAVIS root, which brings its own split.
+A folder may hold video files and folders of frames at any depth, or be a DAVIS root, which defines a split.
 """
 
 import os
@@ -16,10 +16,10 @@ VIDEO_SUFFIXES = (".avi", ".gif", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".webp")
 # yt-dlp writes "title [id].mp4", Kinetics "id_000010_000020.mp4".
 _YOUTUBE_ID = re.compile(r"\[([\w-]{11})\]|^([\w-]{11})_\d{6}_\d{6}$")
-# A division that the folder brings along, whatever the case of letters.
+# A split that the folder defines, in any case of letters.
 TRAIN_FOLDERS = ("train", "training")
-UNSEEN_FOLDERS = ("eval", "evaluation", "val", "valid", "validation", "test", "testing")
-# Of each film beside them; more are frames.
+EVAL_FOLDERS = ("eval", "evaluation", "val", "valid", "validation", "test", "testing")
+# Of each video beside them; more images are frames.
 MAX_THUMBNAILS = 4
 _DAVIS_LISTS = {"train": "train.txt", "eval": "val.txt"}
 
@@ -34,7 +34,7 @@ class Source:
     :param path: the video file or the folder of frames
     :param files: the video, or the frames in natural order
     :param stamps: size and time of change of each file
-    :param split: "train" or "eval" where the folder says so, else None
+    :param split: "train" or "eval" where the folder defines it, else None
     """
 
     name: str
@@ -51,7 +51,7 @@ class Source:
 
 
 def natural_key(name: str) -> list[Any]:
-    """Sorts frame2 before frame10, whatever the case of letters.
+    """Sorts frame2 before frame10, in any case of letters.
 
     :param name: a file name or path
     """
@@ -61,8 +61,8 @@ def natural_key(name: str) -> list[Any]:
 def find_sources(root: Path) -> tuple[Source, ...]:
     """All clips in a folder, sorted by name.
 
-    ``root/train`` and ``root/eval`` (:data:`TRAIN_FOLDERS` and :data:`UNSEEN_FOLDERS`), where both exist, are taken as
-    the split. Links to folders are followed. Hidden files are left out, and so are pictures beside video files (their
+    ``root/train`` and ``root/eval`` (:data:`TRAIN_FOLDERS` and :data:`EVAL_FOLDERS`), where both exist, are taken as
+    the split. Links to folders are followed. Hidden files are left out, and so are images beside video files (their
     thumbnails).
 
     :param root: the folder
@@ -76,7 +76,7 @@ def find_sources(root: Path) -> tuple[Source, ...]:
         return _find_davis(root)
     sides = {
         side: [folder for folder in sorted(root.iterdir()) if folder.name.lower() in names and folder.is_dir()]
-        for side, names in (("train", TRAIN_FOLDERS), ("eval", UNSEEN_FOLDERS))
+        for side, names in (("train", TRAIN_FOLDERS), ("eval", EVAL_FOLDERS))
     }
     if sides["train"] and sides["eval"]:
         sources = [source for side, folders in sides.items() for folder in folders for source in _find(folder, side)]
@@ -109,8 +109,8 @@ def _find(root: Path, split: str | None) -> list[Source]:
         clips = [(video, [video]) for video in videos]
         if videos and len(images) > MAX_THUMBNAILS * len(videos):
             raise ValueError(
-                f"{here} holds {len(images)} pictures beside {videos[0].name}: frames or thumbnails? Move the pictures "
-                "or the video, to a folder of their own"
+                f"{here} holds {len(images)} images beside {videos[0].name}: frames or thumbnails? "
+                "Move the images or the video to another folder"
             )
         if images and not videos:
             clips.append((here, images))
@@ -145,7 +145,7 @@ def _find_davis(root: Path) -> tuple[Source, ...]:
 
 
 def split_sources(sources: tuple[Source, ...], seed: int, eval_fraction: float) -> dict[str, tuple[Source, ...]]:
-    """The sources of each side: as the folder says, else by groups ranked by a hash of ``seed`` and name.
+    """The sources of each side: as the folder defines it, else by groups ranked by a hash of ``seed`` and name.
 
     :param sources: at least one, from :func:`find_sources`
     :param seed: of the split by hash
@@ -162,7 +162,7 @@ def split_sources(sources: tuple[Source, ...], seed: int, eval_fraction: float) 
         if len(groups) < 2:
             raise ValueError(
                 f"the {len(sources)} clips found belong to one group, {groups.pop()!r}, which would leave a side of "
-                "the split empty; add another video, or divide them yourself into two folders train and eval"
+                "the split empty; add another video, or divide them into two folders, train and eval"
             )
         sides = dict(zip(SPLITS, split_groups(groups, seed, eval_fraction), strict=True))
     chosen = {side: tuple(source for source in sources if source.group in sides[side]) for side in SPLITS}

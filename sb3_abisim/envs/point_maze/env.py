@@ -17,7 +17,7 @@ from sb3_abisim.envs.point_maze.layout import (
     OBSTACLE_PIXELS,
     PIXELS_PER_METER,
     WALL_PIXELS,
-    draw_layout,
+    sample_layout,
     static_layer,
     to_meters,
     to_pixels,
@@ -109,21 +109,21 @@ def point_model() -> mujoco.MjModel:
 class PointMazeVectorEnv(BatchEnv):
     """``num_envs`` point mazes, their physics advanced by one call.
 
-    **World.** A room of 15 m x 15 m inside walls of 0.5 m; the picture shows 16 m x 16 m at exactly 4 pixels per
-    meter. Positions are (x, y) in meters from the center of the room, x to the right and y *down* the picture. Each
-    episode has 20 obstacles of 2 m x 2 m with corners on the pixel grid, uniform over the room outside the 2 m x 2 m
-    square around the goal; they may overlap. The start is uniform over the positions that keep 0.125 m between the
-    ball's center and everything solid and lie outside the goal. Obstacles and start are drawn again until a corridor
-    0.5 m wide leads from the start to the goal, which is the center (0, 0).
+    **World.** A room of 15 m x 15 m inside walls of 0.5 m; the observation shows 16 m x 16 m at exactly 4 pixels per
+    meter. Positions are (x, y) in meters from the center of the room, x to the right and y *down*. Each episode has 20
+    obstacles of 2 m x 2 m with corners on the pixel grid, uniform over the room outside the 2 m x 2 m square around the
+    goal; they may overlap. The start is uniform over the positions that keep 0.125 m between the ball's center and
+    everything solid and lie outside the goal. Obstacles and start are sampled again until a corridor 0.5 m wide leads
+    from the start to the goal, which is the center (0, 0).
 
     **Actions.** 0, 1, 2, 3 push with full force up, down, left, right; with ``continuous`` a force (x, y) in
     ``Box(-1, 1, (2,), float32)``, x to the right and y down, in units of 100 N per axis.
 
     **Physics.** MuJoCo on the point body of gymnasium-robotics: a ball of 4.19 kg and 0.1 m radius, joint damping 1,
     friction 0.5, time step 0.01 s, velocity clipped to 5 m/s per axis before every time step. A step of the
-    environment is 30 time steps. It begins from rest, so that one picture is the whole state, and a push covers about
-    1 m of free floor; ``momentum=True`` keeps the velocity instead. Where nothing lies in the ball's way, the 30 time
-    steps from rest are summed in closed form (:func:`free_displacement`, equal to MuJoCo's to 1e-12 m).
+    environment is 30 time steps. It begins from rest, so that one observation is the whole state, and a push covers
+    about 1 m of free floor; ``momentum=True`` keeps the velocity instead. Where nothing lies in the ball's way, the 30
+    time steps from rest are summed in closed form (:func:`free_displacement`, equal to MuJoCo's to 1e-12 m).
 
     **Observation.** uint8 (3, 64, 64), RGB: light floor, dark walls and obstacles, a green square of 1 m at the goal,
     and the agent as a red disc of 0.3 m radius, antialiased, so that its position can be read to a fraction of a
@@ -141,7 +141,7 @@ class PointMazeVectorEnv(BatchEnv):
     :param momentum: keep the velocity from one step to the next
     :param n_threads: threads for the physics, at least 1; the results do not depend on it
     :param max_episode_steps: steps after which an episode is truncated, None for no limit
-    :param render_mode: None or "rgb_array", pictures of 512 x 512
+    :param render_mode: None or "rgb_array", which renders 512 x 512 pixels
     :param autoreset: False leaves finished copies for :class:`PointMazeEnv` to reset
     :raises ValueError: for an unknown ``reward_type`` or ``n_threads`` below 1
     """
@@ -167,14 +167,14 @@ class PointMazeVectorEnv(BatchEnv):
             action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         else:
             action_space = gym.spaces.Discrete(len(DIRECTIONS))
-        pictures = gym.spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
-        super().__init__(num_envs, pictures, action_space, max_episode_steps, render_mode, autoreset)
+        observation_space = gym.spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
+        super().__init__(num_envs, observation_space, action_space, max_episode_steps, render_mode, autoreset)
         self.continuous = continuous
         self.reward_type = reward_type
         self.momentum = momentum
         self._connect(n_threads)
-        self._layers = np.zeros((num_envs, *pictures.shape), dtype=np.uint8)
-        # 255 where floor is seen, and the layer elsewhere: to lay the layer over other pictures by bitwise operations.
+        self._layers = np.zeros((num_envs, *observation_space.shape), dtype=np.uint8)
+        # 255 where floor is seen, and the layer elsewhere: to lay the layer over backgrounds by bitwise operations.
         self._floor = np.zeros((num_envs, 1, IMAGE_SIZE, IMAGE_SIZE), dtype=np.uint8)
         self._standing = np.zeros_like(self._layers)
         self._agent = top_down.DiscPainter(AGENT_RADIUS * PIXELS_PER_METER, IMAGE_SIZE)
@@ -210,7 +210,7 @@ class PointMazeVectorEnv(BatchEnv):
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i in indices:
-            corners, solid, start = draw_layout(self._generators[i])
+            corners, solid, start = sample_layout(self._generators[i])
             self._obstacle_pos[i] = to_meters(corners + OBSTACLE_PIXELS / 2)
             self._position[i] = start
             self._solid_counts[i, 1:, 1:] = solid.cumsum(axis=0).cumsum(axis=1)
@@ -269,12 +269,12 @@ class PointMazeVectorEnv(BatchEnv):
         return solid
 
     def _observe(self, indices: NDArray[np.int64]) -> NDArray[np.uint8]:
-        pictures = self._layers[indices]
-        self._agent.draw(pictures, to_pixels(self._position[indices]))
-        return pictures
+        observations = self._layers[indices]
+        self._agent.render(observations, to_pixels(self._position[indices]))
+        return observations
 
     def _observe_over(self, backgrounds: NDArray[np.uint8], indices: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """The observations with pictures in place of the floor.
+        """The observations with backgrounds in place of the floor.
 
         Pixels that agent, obstacles, goal or walls touch, the agent's antialiased edge among them, have the bytes of
         the plain observation.
@@ -283,16 +283,16 @@ class PointMazeVectorEnv(BatchEnv):
         :return: ``backgrounds``
         """
         self._lay_over(backgrounds, indices)
-        self._agent.draw(backgrounds, to_pixels(self._position[indices]), over=self._layers[indices])
+        self._agent.render(backgrounds, to_pixels(self._position[indices]), over=self._layers[indices])
         return backgrounds
 
     def _lay_over(self, backgrounds: NDArray[np.uint8], indices: NDArray[np.int64]) -> None:
-        """Replace the floor of the static layers by pictures, in place: shape (len(indices), 3, 64, 64)."""
+        """Replace all of the backgrounds but the floor by the static layers, in place."""
         np.bitwise_and(backgrounds, self._floor[indices], out=backgrounds)
         np.bitwise_or(backgrounds, self._standing[indices], out=backgrounds)
 
     def _backdrop(self, index: int) -> NDArray[np.uint8]:
-        """The picture of one copy without its agent, shape (3, 64, 64); what ``render`` enlarges."""
+        """The observation of one copy without its agent, shape (3, 64, 64); what ``render`` enlarges."""
         backdrop: NDArray[np.uint8] = self._layers[index]
         return backdrop
 
@@ -300,7 +300,7 @@ class PointMazeVectorEnv(BatchEnv):
         return top_down.enlarge(self._backdrop(index), to_pixels(self._position[index]), self._agent.radius)
 
     def factors(self) -> dict[str, NDArray[Any]]:
-        """The simulator's state behind the current observations, for probes; see the class."""
+        """The simulator's state that the current observations show, for probes; see the class."""
         factors = {
             "agent": self._position.astype(np.float32),
             "obstacles": self._obstacle_pos.astype(np.float32),

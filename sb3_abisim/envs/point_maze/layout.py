@@ -1,10 +1,11 @@
-"""The rooms of PointMaze: where obstacles and starts may lie, and what stands still in the picture."""
+"""The rooms of PointMaze: where obstacles and starts may lie, and what stands still in an observation."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.grids import flood_fill, pack, unpack
 from sb3_abisim.envs.point_maze import top_down
 from sb3_abisim.envs.point_maze.top_down import IMAGE_SIZE
 
@@ -21,7 +22,7 @@ _CENTER = IMAGE_SIZE // 2
 def to_pixels(positions: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
     """Positions (x, y) in meters, shape (..., 2), as (column, row) in pixels.
 
-    :param positions: in meters from the middle of the picture, y down
+    :param positions: in meters from the middle of the observation, y down
     """
     return positions * np.float64(PIXELS_PER_METER) + _CENTER
 
@@ -34,7 +35,8 @@ def to_meters(pixels: NDArray[Any]) -> NDArray[np.float64]:
     return (pixels - _CENTER) / PIXELS_PER_METER
 
 
-# The layout of an episode, computed on bitboards: bit 64 * row + column of a Python int is a pixel.
+# The layout of an episode, computed on bitboards (:mod:`~sb3_abisim.common.grids`) whose cells are pixels. The walls
+# are never free, so shifts do not wrap around.
 
 _STRIDE = IMAGE_SIZE
 
@@ -46,8 +48,7 @@ def _square(column: int, row: int, side: int) -> int:
 
 def _unpack(board: int) -> NDArray[np.bool_]:
     """The pixels of a bitboard, shape (64, 64)."""
-    raw = np.frombuffer(board.to_bytes(IMAGE_SIZE**2 // 8, "little"), dtype=np.uint8)
-    return np.unpackbits(raw, bitorder="little").view(np.bool_).reshape(IMAGE_SIZE, IMAGE_SIZE)
+    return unpack(board, IMAGE_SIZE, _STRIDE)
 
 
 def _corner_choices() -> NDArray[np.int64]:
@@ -62,7 +63,7 @@ def _start_blocks() -> int:
     """The 2 x 2 blocks around whose center no position within half a pixel per axis is at the goal."""
     offset = np.maximum(np.abs(np.arange(IMAGE_SIZE) + 1 - _CENTER) - 0.5, 0.0)
     outside = np.hypot(offset[:, None], offset) > GOAL_RADIUS * PIXELS_PER_METER
-    return int.from_bytes(np.packbits(outside, bitorder="little").tobytes(), "little")
+    return pack(outside)
 
 
 _OBSTACLE = _square(0, 0, OBSTACLE_PIXELS)
@@ -80,21 +81,10 @@ top_down.paint(_EMPTY_LAYER, WALL_MASK, top_down.WALL)
 top_down.paint(_EMPTY_LAYER, GOAL_MASK, top_down.GOAL)
 
 
-def _connected(blocks: int, start: int, goal: int) -> bool:
-    """Whether shifts by one pixel within ``blocks`` lead from ``start`` to ``goal``."""
-    reached = goal & blocks
-    while not reached & start:
-        grown = (reached | reached << 1 | reached >> 1 | reached << _STRIDE | reached >> _STRIDE) & blocks
-        if grown == reached:
-            return False
-        reached = grown
-    return True
+def sample_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64]]:
+    """Sample the obstacles and the start of an episode, until a corridor 0.5 m wide joins start and goal.
 
-
-def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64]]:
-    """Draw the obstacles and the start of an episode, until a corridor 0.5 m wide joins start and goal.
-
-    :param generator: the environment's own
+    :param generator: that of the environment
     :return: (column, row) of the obstacles' top left pixels, shape (20, 2); where obstacles and walls are, bool
         (64, 64); the start (x, y) in meters
     """
@@ -110,13 +100,14 @@ def draw_layout(generator: np.random.Generator) -> tuple[NDArray[np.int64], NDAr
             continue
         block = int(choices[generator.integers(len(choices))])
         jitter = generator.uniform(-0.5, 0.5, size=2)
-        if _connected(blocks, 1 << block, _GOAL_BLOCK):
+        start = 1 << block
+        if flood_fill(_GOAL_BLOCK, blocks, _STRIDE, stop=start) & start:
             row, column = divmod(block, _STRIDE)
             return corners, _unpack(occupied), to_meters(np.array([column + 1, row + 1]) + jitter)
 
 
 def static_layer(solid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """The picture without agent, (3, 64, 64).
+    """The observation without agent, (3, 64, 64).
 
     :param solid: where walls and obstacles are, (64, 64)
     """

@@ -1,4 +1,4 @@
-"""Pixels of the PointMaze kind for gymnasium-robotics' own point mazes."""
+"""Observations of the PointMaze kind for the point mazes of gymnasium-robotics."""
 
 from typing import Any, SupportsFloat
 
@@ -17,20 +17,19 @@ MIN_CELL_PIXELS = 3
 
 
 class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
-    """Shows a gymnasium-robotics ``PointMaze`` from above, as ``PointMaze-v0`` shows its own::
+    """Shows a gymnasium-robotics ``PointMaze`` from above, as ``PointMaze-v0`` shows its rooms::
 
         gym.register_envs(gymnasium_robotics)
         env = PointMazePixels(gym.make("PointMaze_UMaze-v3", continuing_task=False, max_episode_steps=3000),
                               continuous=False, frame_skip=30, momentum=False)
 
-    **Observation.** uint8 (3, 64, 64), RGB, in the colors of ``PointMaze-v0``, drawn without GL: walls where the map
-    has 1, the floor within 0.45 m (its success radius) of the wrapped environment's own goal in green, the
-    agent as a red disc of 0.3 m radius. A cell of the map takes the whole number of pixels that fits the map into the
-    picture; what lies around the map is drawn as wall. With ``backgrounds`` the floor shows moving pictures.
+    **Observation.** uint8 (3, 64, 64), RGB, in the colors of ``PointMaze-v0``, rendered without GL: walls where the map
+    has 1, the floor within 0.45 m (the success radius) of the wrapped environment's goal in green, the agent as a red
+    disc of 0.3 m radius. A cell of the map takes the whole number of pixels that fits the map into the observation;
+    what lies around the map is shown as wall. With ``backgrounds`` the floor shows video clips.
 
     **Actions.** As in ``PointMaze-v0``: forces (x, y) in ``Box(-1, 1, (2,), float32)``, x to the right and y *down*
-    the picture (gymnasium-robotics has y up), or with ``continuous=False`` 0, 1, 2, 3 for a full push up, down, left,
-    right.
+    (gymnasium-robotics has y up), or with ``continuous=False`` 0, 1, 2, 3 for a full push up, down, left, right.
 
     **Steps.** A step of gymnasium-robotics is 0.01 s with momentum. ``frame_skip=30, momentum=False`` gives the steps
     of ``PointMaze-v0``, about 1 m each. Rewards of skipped steps are summed, and skipping stops where an episode ends.
@@ -38,8 +37,8 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
 
     **Info.** ``is_success`` is true where the goal was reached during the step (gymnasium-robotics' ``success``).
 
-    This is an environment of its own that holds the other as ``env``, not a ``gymnasium.Wrapper``: Stable-Baselines3
-    takes whatever has a goal-conditioned environment at its core for one.
+    This is an environment that holds the other as ``env``, not a ``gymnasium.Wrapper``: Stable-Baselines3 takes
+    whatever has a goal-conditioned environment at its core for one.
 
     :param env: a ``PointMaze`` of gymnasium-robotics, with any map
     :param continuous: forces; False for four pushes
@@ -48,7 +47,8 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
     :param backgrounds: clips to show on the floor, from
         :func:`~sb3_abisim.envs.backgrounds.load.load_backgrounds`; None for plain floor
     :param order: "video" or "shuffled", of the frames of a clip
-    :param color_jitter: whether each episode shows its clip in a look of its own, as the Distractor environments train
+    :param color_jitter: whether each episode shows its clip with another color jitter, as train episodes of the
+        Distractor environments do
     :raises ValueError: for another kind of environment, a map of more than 21 cells a side, or ``frame_skip`` below 1
     """
 
@@ -80,28 +80,28 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
             self.action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
         else:
             self.action_space = gym.spaces.Discrete(len(DIRECTIONS))
-        self._walls = self._draw_walls()
+        self._walls = self._render_walls()
         self._goal = DiscPainter(GOAL_RADIUS * self._pixels_per_meter, IMAGE_SIZE, top_down.GOAL)
         self._agent = DiscPainter(AGENT_RADIUS * self._pixels_per_meter, IMAGE_SIZE)
         self._player = None if backgrounds is None else BackgroundPlayer(backgrounds, 1, order, color_jitter)
 
-    def _draw_walls(self) -> NDArray[np.bool_]:
-        """The map fitted into the picture; sets the scale."""
+    def _render_walls(self) -> NDArray[np.bool_]:
+        """The map fitted into the observation; sets the scale."""
         maze = self._maze_env.maze
         walls = np.array([[cell == 1 for cell in row] for row in maze.maze_map])
         cell = IMAGE_SIZE // max(walls.shape)
         if cell < MIN_CELL_PIXELS:
             raise ValueError(
-                f"a map of {walls.shape[0]} x {walls.shape[1]} cells does not fit a picture of {IMAGE_SIZE} pixels; "
+                f"a map of {walls.shape[0]} x {walls.shape[1]} cells does not fit {IMAGE_SIZE} pixels a side; "
                 f"use one of at most {IMAGE_SIZE // MIN_CELL_PIXELS} cells a side"
             )
         self._pixels_per_meter = cell / maze.maze_size_scaling
-        picture = np.ones((IMAGE_SIZE, IMAGE_SIZE), dtype=bool)
+        mask = np.ones((IMAGE_SIZE, IMAGE_SIZE), dtype=bool)
         height, width = (cell * n for n in walls.shape)
         top, left = (IMAGE_SIZE - height) // 2, (IMAGE_SIZE - width) // 2
-        picture[top : top + height, left : left + width] = walls.repeat(cell, axis=0).repeat(cell, axis=1)
+        mask[top : top + height, left : left + width] = walls.repeat(cell, axis=0).repeat(cell, axis=1)
         self._center = np.array([left + width / 2, top + height / 2])
-        return picture
+        return mask
 
     def _to_pixels(self, position: NDArray[np.float64]) -> NDArray[np.float64]:
         """The wrapped environment's (x, y), y up, as one (column, row): shape (1, 2)."""
@@ -124,12 +124,12 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         :param seed: determines the wrapped environment and the clips
         :param options: of the wrapped environment (``goal_cell``, ``reset_cell``)
         """
-        # The clips draw from `np_random` here, the maze from the wrapped environment's: any clips, the same mazes.
+        # The clips sample from `np_random` here, the maze from the wrapped environment's: any clips, the same mazes.
         super().reset(seed=seed)
         _, info = self.env.reset(seed=seed, options=options)
         if self._player is not None:
             self._player.start(0, self.np_random)
-        return self._picture(), info
+        return self._observe(), info
 
     def step(self, action: Any) -> tuple[NDArray[np.uint8], SupportsFloat, bool, bool, dict[str, Any]]:
         """Take one action.
@@ -150,7 +150,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
                 break
         if self._player is not None:
             self._player.advance()
-        return self._picture(), total, terminated, truncated, {**info, "is_success": success}
+        return self._observe(), total, terminated, truncated, {**info, "is_success": success}
 
     def _force(self, action: Any) -> NDArray[np.float32]:
         """The wrapped environment's action."""
@@ -160,25 +160,25 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         force = array if self.continuous else DIRECTIONS[int(array)]
         return (force * (1, -1)).astype(np.float32)
 
-    def _picture(self, agent: bool = True) -> NDArray[np.uint8]:
-        """What is seen now, with or without the agent, shape (3, 64, 64)."""
-        pictures = top_down.floor(IMAGE_SIZE)[None]
-        self._goal.draw(pictures, self._goal_pixels)
-        top_down.paint(pictures[0], self._walls, top_down.WALL)
+    def _observe(self, agent: bool = True) -> NDArray[np.uint8]:
+        """The current observation, with or without the agent, shape (3, 64, 64)."""
+        observations = top_down.floor(IMAGE_SIZE)[None]
+        self._goal.render(observations, self._goal_pixels)
+        top_down.paint(observations[0], self._walls, top_down.WALL)
         if agent:
-            self._agent.draw(pictures, self._agent_pixels)
+            self._agent.render(observations, self._agent_pixels)
         if self._player is not None:
             masks = self._walls[None].copy()
             self._goal.mark(masks, self._goal_pixels)
             if agent:
                 self._agent.mark(masks, self._agent_pixels)
-            pictures = composite(pictures, masks, self._player.pictures(np.arange(1)))
-        picture: NDArray[np.uint8] = pictures[0]
-        return picture
+            observations = composite(observations, masks, self._player.frames(np.arange(1)))
+        observation: NDArray[np.uint8] = observations[0]
+        return observation
 
     def render(self) -> NDArray[np.uint8]:
-        """A picture that a person can look at, (512, 512, 3) uint8, RGB."""
-        return top_down.enlarge(self._picture(agent=False), self._agent_pixels[0], self._agent.radius)
+        """An image for people, (512, 512, 3) uint8, RGB."""
+        return top_down.enlarge(self._observe(agent=False), self._agent_pixels[0], self._agent.radius)
 
     def close(self) -> None:
         """Close the wrapped environment."""

@@ -1,11 +1,11 @@
 """A small rasterizer for mazes seen from straight above, without GL.
 
-A picture is the static layer of an episode (floor, walls, obstacles, goal; every edge lies on the pixel grid) plus the
-agent, a disc whose pixels are mixed in proportion to the area it covers of them. The mixing is integer arithmetic on
-a table of coverages, so the same state gives the same bytes in a batch and alone.
+An observation is the static layer of an episode (floor, walls, obstacles, goal; every edge lies on the pixel grid) plus
+the agent, a disc whose pixels are mixed in proportion to the area it covers of them. The mixing is integer arithmetic
+on a table of coverages, so the same state gives the same bytes in a batch and alone.
 
-Pictures are uint8, channels first, RGB. Pixel coordinates are (column, row) as real numbers: (0, 0) is the top left
-corner of the picture and pixel (row r, column c) is the square [c, c + 1) x [r, r + 1).
+Observations are uint8, channels first, RGB. Pixel coordinates are (column, row) as real numbers: (0, 0) is the top left
+corner and pixel (row r, column c) is the square [c, c + 1) x [r, r + 1).
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 IMAGE_SIZE = 64
 AGENT_RADIUS = 0.3  # m
-# Directions of the discrete actions as seen in the picture, x to the right and y down; in Nav2D's order.
+# Directions of the discrete actions as observed, x to the right and y down; in Nav2D's order.
 DIRECTIONS = np.array([(0, -1), (0, 1), (-1, 0), (1, 0)], dtype=np.float64)
 
 FLOOR = (226, 226, 220)
@@ -24,7 +24,7 @@ OBSTACLE = (38, 44, 64)
 GOAL = (40, 170, 70)
 AGENT = (220, 40, 40)
 
-# Positions within a pixel are told apart to 1/128 of it: at most two gray levels between neighboring ones.
+# Positions within a pixel are rounded to 1/128 of it: at most two gray levels between neighboring ones.
 _SUBPIXEL_BITS = 7
 SUBPIXELS = 1 << _SUBPIXEL_BITS
 _PART_WEIGHTS = np.array((1, SUBPIXELS))
@@ -76,10 +76,10 @@ def _patch_size(radius: float) -> int:
 
 
 class DiscPainter:
-    """Draws one antialiased disc into each picture of a batch.
+    """Renders one antialiased disc into each observation of a batch.
 
     :param radius: in pixels
-    :param size: height and width of the pictures, in pixels
+    :param size: height and width of the observations, in pixels
     :param color: RGB, 0..255
     """
 
@@ -99,23 +99,25 @@ class DiscPainter:
         fine = np.floor((centers - self.radius) * SUBPIXELS).astype(np.int64)
         # Negative numbers are the largest unsigned ones.
         if fine.view(np.uint64).max() >= self._limit:
-            raise ValueError(f"a disc of {self.radius} pixels leaves the {self.size} x {self.size} picture: {centers}")
+            raise ValueError(
+                f"a disc of {self.radius} pixels leaves the {self.size} x {self.size} observation: {centers}"
+            )
         whole, part = fine >> _SUBPIXEL_BITS, fine & (SUBPIXELS - 1)
         return whole @ self._weights, self._alphas[part @ _PART_WEIGHTS]
 
-    def draw(
-        self, pictures: NDArray[np.uint8], centers: NDArray[np.float64], over: NDArray[np.uint8] | None = None
+    def render(
+        self, observations: NDArray[np.uint8], centers: NDArray[np.float64], over: NDArray[np.uint8] | None = None
     ) -> None:
-        """Draw the discs in place.
+        """Render the discs in place.
 
-        :param pictures: contiguous, shape (n, 3, size, size)
+        :param observations: contiguous, shape (n, 3, size, size)
         :param centers: (column, row) in pixels, shape (n, 2)
-        :param over: what the discs' edges mix with, contiguous and shaped like ``pictures``; None for ``pictures``
-        :raises ValueError: where a disc, or the pixel beside it, would lie outside the picture
+        :param over: what the discs' edges mix with, contiguous and shaped like ``observations``, which None stands for
+        :raises ValueError: where a disc, or the pixel beside it, would lie outside the observation
         """
         first, alphas = self._locate(centers)
-        flat = pictures.reshape(-1)
-        starts = first + np.arange(len(pictures)) * (3 * self.size**2)
+        flat = observations.reshape(-1)
+        starts = first + np.arange(len(observations)) * (3 * self.size**2)
         where = starts[:, None, None] + self._channels
         alpha = alphas[:, None, :].astype(np.uint32)
         below = flat[where] if over is None else over.reshape(-1)[where]
@@ -135,21 +137,21 @@ class DiscPainter:
 
 
 def floor(size: int) -> NDArray[np.uint8]:
-    """A picture of nothing but floor, shape (3, size, size).
+    """An observation of nothing but floor, shape (3, size, size).
 
     :param size: height and width, in pixels
     """
     return np.tile(np.array(FLOOR, dtype=np.uint8)[:, None, None], (1, size, size))
 
 
-def paint(picture: NDArray[np.uint8], where: NDArray[np.bool_], color: tuple[int, int, int]) -> None:
-    """Fill the pixels ``where`` (height, width) of one picture (3, height, width) with a color, in place.
+def paint(observation: NDArray[np.uint8], where: NDArray[np.bool_], color: tuple[int, int, int]) -> None:
+    """Fill the pixels ``where`` (height, width) of one observation (3, height, width) with a color, in place.
 
-    :param picture: uint8, contiguous or not
+    :param observation: uint8, contiguous or not
     :param where: bool
     :param color: RGB, 0..255
     """
-    for channel, value in zip(picture, color, strict=True):
+    for channel, value in zip(observation, color, strict=True):
         channel[where] = value
 
 
@@ -159,9 +161,9 @@ def enlarge(
     radius: float,
     scale: int = 8,
 ) -> NDArray[np.uint8]:
-    """A picture for people: the backdrop with sharp, larger pixels and the disc drawn at the larger scale.
+    """An image for people: the backdrop with sharp, larger pixels and the disc rendered at the larger scale.
 
-    :param backdrop: the picture without the agent, shape (3, size, size)
+    :param backdrop: the observation without the agent, shape (3, size, size)
     :param center: (column, row) of the disc in pixels of the backdrop
     :param radius: in pixels of the backdrop
     :param scale: how many pixels each pixel becomes per side

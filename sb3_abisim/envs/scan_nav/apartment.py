@@ -1,7 +1,7 @@
-"""Furnished flats, drawn by a seed: what ScanNav shows where there is no scan.
+"""Furnished apartments, sampled by a seed: what ScanNav shows where there is no scan.
 
-A flat is a mesh like that of a scan: a textured floor, walls with doors and windows, furniture, and ceilings, which
-are seen from below only. It is made by rules of thumb and passes through the same code as a scan.
+An apartment is a mesh like that of a scan: a textured floor, walls with doors and windows, furniture, and ceilings,
+which are seen from below only. It is made by rules of thumb and passes through the same code as a scan.
 """
 
 from collections.abc import Callable
@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sb3_abisim.envs.scan_nav.furniture import ROOMS, TEXTURE_SIZE, TEXTURES, Piece, Solid, texture
+from sb3_abisim.envs.scan_nav.furniture import ROOMS, Piece, Solid
 from sb3_abisim.envs.scan_nav.mesh import ScanMesh, Surface
+from sb3_abisim.envs.scan_nav.textures import FLOOR_PIXELS, TEXTURE_SIZE, TEXTURES, planks, rug, texture, tiles
 
-# Part of the cache's key: raise it where the same seed gives another flat.
+# Hashed into the names of cached maps: raise it where the same seed gives another apartment.
 VERSION = 2
-# Part of the seeds: raising it would draw all flats anew.
-_DRAWING = 1
+# Part of the seeds: another value gives other apartments.
+_SEED_VERSION = 1
 SEEDS = (0, 1, 2, 3, 4)
 OUTER_WALL, INNER_WALL, WALL_HEIGHT = 0.3, 0.12, 2.6  # m
 DOOR_WIDTH, DOOR_HEIGHT = 0.9, 2.05  # m
 # Panes and doors end below the lintel. Were the two surfaces in one plane, none would be the first above the map's cut,
 # and whether one sees a pane would be left to the order of the faces.
 _GAP = 0.01  # m
-_FLOOR_PIXELS = 50  # per m
 _ROUND = 20  # sides of a cylinder
 # Lengths here are whole centimeters, and edges exactly on the centers of a map's pixels would be left to rounding.
 _OFFSET = (0.0037, 0.0043)  # m
@@ -90,25 +90,25 @@ class _Builder:
 
 
 def apartment_mesh(seed: int) -> ScanMesh:
-    """A furnished flat: a hall with rooms on both sides, and a living room across its end.
+    """A furnished apartment: a hall with rooms on both sides, and a living room across its end.
 
     :param seed: at least 0
     :raises ValueError: for a seed that is none
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"the seed of a flat must be a whole number of at least 0, got {seed!r}")
-    rng = np.random.default_rng([_DRAWING, seed])
+        raise ValueError(f"the seed of an apartment must be a whole number of at least 0, got {seed!r}")
+    rng = np.random.default_rng([_SEED_VERSION, seed])
     width, depth = float(rng.uniform(12.5, 14.5)), float(rng.uniform(9.2, 10.4))
     builder = _Builder()
     rooms, walls = _layout(rng, width, depth)
-    # Mirrored flats are different flats; the rules need not know.
+    # Mirrored apartments are different apartments; the rules need not know.
     mirror = rng.random(2) < 0.5
     for wall in walls:
         _build_wall(builder, wall)
         for start, end, kind in wall.openings:
             if kind == "door":
                 _reserve_door(rooms, wall, start, end)
-    rugs: list[tuple[Box, str]] = []
+    rugs: list[Box] = []
     for room in rooms:
         _furnish(builder, rng, room, rugs)
         x0, y0, x1, y1 = room.box
@@ -224,11 +224,11 @@ def _overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _furnish(builder: _Builder, rng: np.random.Generator, room: _Room, rugs: list[tuple[Box, str]]) -> None:
+def _furnish(builder: _Builder, rng: np.random.Generator, room: _Room, rugs: list[Box]) -> None:
     if room.kind in ("living room", "bedroom", "child's room", "study"):
         x0, y0, x1, y1 = room.box
         middle, half = ((x0 + x1) / 2, (y0 + y1) / 2), np.minimum(rng.uniform(0.2, 0.3, 2) * (x1 - x0, y1 - y0), 1.3)
-        rugs.append(((middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1]), room.kind))
+        rugs.append((middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1]))
     for make in ROOMS[room.kind]:
         _place(builder, rng, room, make(rng))
 
@@ -244,7 +244,6 @@ def _place(builder: _Builder, rng: np.random.Generator, room: _Room, piece: Piec
         offset = float(rng.uniform(0, length - piece.width))
         # Corners are popular.
         offset = float(rng.choice([0.0, offset, length - piece.width]))
-
         place = _frame(room.box, side, offset)
         needed = place(0, 0, piece.width, piece.depth + piece.front)
         inside = needed[0] >= x0 - 1e-6 and needed[1] >= y0 - 1e-6 and needed[2] <= x1 + 1e-6 and needed[3] <= y1 + 1e-6
@@ -257,7 +256,7 @@ def _place(builder: _Builder, rng: np.random.Generator, room: _Room, piece: Piec
 
 
 def _frame(box: Box, side: int, offset: float) -> Callable[[float, float, float, float], Box]:
-    """Turns a box in a piece's own frame, standing at a wall of the room, into one of the flat."""
+    """Turns a box in the coordinates of a piece, standing at a wall of the room, into one of the apartment."""
     x0, y0, x1, y1 = box
 
     def place(u0: float, v0: float, u1: float, v1: float) -> Box:
@@ -283,82 +282,43 @@ def _floor_texture(
     rng: np.random.Generator,
     rooms: list[_Room],
     walls: list[_Wall],
-    rugs: list[tuple[Box, str]],
+    rugs: list[Box],
     solids: list[NDArray[np.float64]],
     size: tuple[float, float],
 ) -> NDArray[np.uint8]:
-    """One picture of the whole floor: planks, tiles, rugs, and the shade beside walls and furniture."""
-    shape = round(size[1] * _FLOOR_PIXELS), round(size[0] * _FLOOR_PIXELS)
-    picture = np.full((*shape, 3), 150.0)
+    """The texture of the whole floor: planks, tiles, rugs, and the shade beside walls and furniture."""
+    shape = round(size[1] * FLOOR_PIXELS), round(size[0] * FLOOR_PIXELS)
+    colors = np.full((*shape, 3), 150.0)
     oak = [(178, 140, 98), (150, 110, 74), (196, 168, 130), (128, 96, 72)][rng.integers(4)]
     for room in rooms:
         rows, columns = _pixels(room.box, shape, margin=0.2)
         n = rows.stop - rows.start, columns.stop - columns.start
         if room.kind in ("bathroom", "kitchen"):
-            picture[rows, columns] = _tiles(rng, n)
+            colors[rows, columns] = tiles(rng, n)
         else:
-            picture[rows, columns] = _planks(rng, n, oak)
-    for box, kind in rugs:
+            colors[rows, columns] = planks(rng, n, oak)
+    for box in rugs:
         rows, columns = _pixels(box, shape)
-        picture[rows, columns] = _rug(rng, (rows.stop - rows.start, columns.stop - columns.start), kind)
+        colors[rows, columns] = rug(rng, (rows.stop - rows.start, columns.stop - columns.start))
     occupied = np.zeros(shape)
     for points in solids:
         if points[:, 2].max() < 0.1 or points[:, 2].min() > 1.0:
             continue
         box = (points[:, 0].min(), points[:, 1].min(), points[:, 0].max(), points[:, 1].max())
         occupied[_pixels(box, shape)] = 1
-    shade = 1 - 0.55 * ndimage.gaussian_filter(occupied, 0.14 * _FLOOR_PIXELS)
+    shade = 1 - 0.55 * ndimage.gaussian_filter(occupied, 0.14 * FLOOR_PIXELS)
     light = np.zeros(shape)
     for wall in walls:
         for start, end, kind in wall.openings:
             if kind == "window":
                 light[_pixels(wall.box(start, end, 1.6), shape)] = 1
-    shade *= 0.92 + 0.35 * ndimage.gaussian_filter(light, 0.6 * _FLOOR_PIXELS)
-    # Pictures run downwards, y upwards.
-    return np.asarray(np.clip(picture * shade[..., None], 0, 255).astype(np.uint8)[::-1])
+    shade *= 0.92 + 0.35 * ndimage.gaussian_filter(light, 0.6 * FLOOR_PIXELS)
+    # Textures run downwards, y upwards.
+    return np.asarray(np.clip(colors * shade[..., None], 0, 255).astype(np.uint8)[::-1])
 
 
 def _pixels(box: Box, shape: tuple[int, int], margin: float = 0.0) -> tuple[slice, slice]:
     x0, y0, x1, y1 = (
-        round(k * _FLOOR_PIXELS) for k in (box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin)
+        round(k * FLOOR_PIXELS) for k in (box[0] - margin, box[1] - margin, box[2] + margin, box[3] + margin)
     )
     return slice(max(y0, 0), min(max(y1, y0 + 1), shape[0])), slice(max(x0, 0), min(max(x1, x0 + 1), shape[1]))
-
-
-def _planks(rng: np.random.Generator, shape: tuple[int, int], color: tuple[int, int, int]) -> NDArray[np.float64]:
-    """Boards 16 cm wide and 1.2 m long, each row shifted."""
-    board = round(0.16 * _FLOOR_PIXELS)
-    long = round(1.2 * _FLOOR_PIXELS)
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    row = y // board
-    column = (x + (row * 47) % long) // long
-    tone = rng.normal(0, 10, (row.max() + 1, column.max() + 1))[row, column]
-    grain = ndimage.gaussian_filter(rng.standard_normal(shape), (0.6, 6))
-    light = tone + grain / grain.std() * 6
-    light = light - 20.0 * ((y % board == 0) | ((x + (row * 47) % long) % long == 0))
-    return np.asarray(np.array(color) + light[..., None])
-
-
-def _tiles(rng: np.random.Generator, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Square tiles of 30 cm, of one color or two."""
-    side = round(0.3 * _FLOOR_PIXELS)
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    pairs = [((206, 206, 200), (206, 206, 200)), ((220, 220, 216), (120, 132, 140)), ((196, 176, 150), (184, 160, 132))]
-    colors = np.array(pairs[rng.integers(len(pairs))], dtype=np.float64)
-    picture = colors[(y // side + x // side) % 2]
-    tone = rng.normal(0, 5, (shape[0] // side + 1, shape[1] // side + 1))[y // side, x // side]
-    joint = (y % side == 0) | (x % side == 0)
-    tiled: NDArray[np.float64] = np.where(joint[..., None], 150.0, picture + tone[..., None])
-    return tiled
-
-
-def _rug(rng: np.random.Generator, shape: tuple[int, int], kind: str) -> NDArray[np.float64]:
-    """A border and a pattern of lozenges or stripes."""
-    colors = np.array([(150, 52, 48), (52, 76, 110), (176, 168, 150), (92, 110, 92), (120, 84, 120)], dtype=np.float64)
-    ground, figure = colors[rng.permutation(len(colors))[:2]]
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    pattern = (abs(y % 20 - 10) + abs(x % 20 - 10)) < 6 if rng.random() < 0.6 else (x // 6) % 2 == 0
-    picture = np.where(pattern[..., None], figure, ground)
-    edge = np.minimum(np.minimum(y, shape[0] - 1 - y), np.minimum(x, shape[1] - 1 - x))
-    picture[(edge > 2) & (edge < 6)] = figure
-    return np.asarray(picture + rng.normal(0, 5, shape)[..., None])

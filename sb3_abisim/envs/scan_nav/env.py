@@ -24,9 +24,9 @@ Scene = ScanMap | str | os.PathLike[str] | int
 
 
 class ScanNavVectorEnv(BatchEnv):
-    """Walk to the middle of the picture in scanned places; ``num_envs`` copies. ``ScanNavEnv`` is the batch of one.
+    """Walk to the middle of the view in scanned places; ``num_envs`` copies. ``ScanNavEnv`` is the batch of one.
 
-    **Observation.** What an orthographic camera above the goal sees, north up, the goal in the middle, the agent drawn
+    **Observation.** What an orthographic camera above the goal sees, north up, the goal in the middle, the agent shown
     as a yellow marker with a magenta nose. ``obs_mode="rgbd"``: ``Box(0, 255, (4, image_size, image_size), uint8)``,
     red, green, blue, and depth as 255 (3 m - z) / 3 m for a surface z above the floor; where there is no surface all
     are 0. ``"rgb"``: the first three. ``"dict"``: Habitat's form, ``rgb`` uint8 (image_size, image_size, 3) and
@@ -55,8 +55,8 @@ class ScanNavVectorEnv(BatchEnv):
     :param max_episode_steps: set by ``gymnasium.make_vec``
     :param render_mode: None or "rgb_array"
     :param autoreset: see :class:`BatchEnv`
-    :param scenes: a scan file, a map's ``.npz`` file, a :class:`ScanMap`, the seed of a flat, or a list of these; None
-        for the five flats
+    :param scenes: a scan file, a map's ``.npz`` file, a :class:`ScanMap`, the seed of an apartment, or a list of these;
+        None for the five apartments
     :param image_size: pixels per side, even, at least 32
     :param view_size: meters per side
     :param obs_mode: "rgbd", "dict" or "rgb"
@@ -76,7 +76,7 @@ class ScanNavVectorEnv(BatchEnv):
     :raises ValueError: for settings out of range
     """
 
-    draws_factors = True
+    renders_factors = True
 
     def __init__(
         self,
@@ -135,7 +135,7 @@ class ScanNavVectorEnv(BatchEnv):
         self.scans = [load_scene(scene) for scene in _as_list(scenes)]
         self._views = [SceneView(scan, image_size, view_size) for scan in self.scans]
         self._painter = MarkerPainter(marker, image_size, self._pitch)
-        # The marker and a pixel stay inside the picture.
+        # The marker and a pixel stay inside the view.
         self._reach = view_size / 2 - MARKER_RADIUS - 2 * self._pitch
         rule = StartRule(min_geodesic, max_geodesic, min_ratio)
         self._world = ScanWorld(self.scans, self._pitch, self._reach, goals_per_scene, num_envs, rule)
@@ -182,14 +182,14 @@ class ScanNavVectorEnv(BatchEnv):
             scene, k = int(generator.integers(len(self.scans))), int(generator.integers(world.n_goals))
             self._scene[i] = options.get("scene", scene)
             if "goal" in options:
-                self._field[i] = world.own[i]
+                self._field[i] = world.custom_fields[i]
             else:
                 self._field[i] = world.prepare_goal(int(self._scene[i]), k)
             if "start" in options:
                 goal = world.goal_positions(self._scene[[i]], self._field[[i]])[0]
                 self._position[i] = np.array(options["start"], dtype=np.float64) - goal
             else:
-                self._position[i] = world.draw_start(int(self._field[i]), generator)
+                self._position[i] = world.sample_start(int(self._field[i]), generator)
             heading = generator.uniform(0, 360)
             self._heading[i] = options.get("heading", heading) % 360
         self._distance[indices] = world.distances(self._field[indices], self._position[indices])
@@ -199,16 +199,16 @@ class ScanNavVectorEnv(BatchEnv):
 
     def _place_goal(self, options: dict[str, Any], indices: NDArray[np.int64]) -> None:
         """Place the goal that reset is asked for, and refuse one without starts, or a start without a way."""
-        world, scene, own = self._world, int(options["scene"]), self._world.own[indices[:1]]
+        world, scene, field = self._world, int(options["scene"]), self._world.custom_fields[indices[:1]]
         world.place_goal(scene, np.array(options["goal"], dtype=np.float64), indices)
         if "start" not in options:
-            if not world.has_starts(int(own[0])):
+            if not world.has_starts(int(field[0])):
                 raise ValueError(
                     f"the goal {options['goal']} has too few starts in its view; take another, or give a start"
                 )
             return
-        start = np.array(options["start"], dtype=np.float64) - world.goal_positions(np.array([scene]), own)[0]
-        if not world.reaches(int(own[0]), start):
+        start = np.array(options["start"], dtype=np.float64) - world.goal_positions(np.array([scene]), field)[0]
+        if not world.reaches(int(field[0]), start):
             raise ValueError(
                 f"there is no way from the start {options['start']} to the goal {options['goal']} within the view; "
                 "take another start"
@@ -269,17 +269,17 @@ class ScanNavVectorEnv(BatchEnv):
             return np.asarray(actions - 1)
         return np.where(self._distance < self.success_distance, 0, actions)
 
-    # Pictures.
+    # Observations.
 
     def _observe(self, indices: NDArray[np.int64]) -> Any:
         scenes, fields = self._scene[indices], self._field[indices]
         goals = self._world.goal_positions(scenes, fields)
-        # Not simply the position: the factors hold the sum, and frames drawn from them must not differ by a rounding.
+        # Not simply the position: the factors hold the sum, and what they render must not differ by a rounding.
         offsets = (goals + self._position[indices]) - goals
-        return self._picture(scenes, self._world.corners[fields], offsets, self._heading[indices])
+        return self._render(scenes, self._world.corners[fields], offsets, self._heading[indices])
 
-    def draw(self, factors: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
-        """See :meth:`BatchEnv.draw`.
+    def render_factors(self, factors: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
+        """See :meth:`BatchEnv.render_factors`.
 
         :param factors: ``agent``, ``goal``, ``heading`` and ``scene``, see the class
         """
@@ -293,10 +293,10 @@ class ScanNavVectorEnv(BatchEnv):
         sizes = np.array([scan.rgbd.shape[1:] for scan in self._views])[scenes] - self.image_size
         if not ((corners >= 0) & (corners <= sizes)).all():
             raise ValueError("factors with a goal outside its scene: not of this setting")
-        frames: NDArray[np.uint8] = self._picture(scenes, corners, offsets, factors["heading"])
-        return frames
+        observations: NDArray[np.uint8] = self._render(scenes, corners, offsets, factors["heading"])
+        return observations
 
-    def _picture(
+    def _render(
         self,
         scenes: NDArray[np.int64],
         corners: NDArray[np.int64],
@@ -305,19 +305,20 @@ class ScanNavVectorEnv(BatchEnv):
     ) -> Any:
         """Observations with the goals at these corners of pixels and the agents this far from them."""
         n = self.image_size
-        frames = np.empty((len(scenes), 3 if self.obs_mode == "rgb" else 4, n, n), dtype=np.uint8)
+        observations = np.empty((len(scenes), 3 if self.obs_mode == "rgb" else 4, n, n), dtype=np.uint8)
         views = list(zip(scenes.tolist(), corners.tolist(), strict=True))
-        for frame, (scene, (row, column)) in zip(frames, views, strict=True):
-            frame[:] = self._views[scene].rgbd[: len(frame), row : row + n, column : column + n]
+        for observation, (scene, (row, column)) in zip(observations, views, strict=True):
+            observation[:] = self._views[scene].rgbd[: len(observation), row : row + n, column : column + n]
         centers = n / 2 + offsets * (1 / self._pitch, -1 / self._pitch)
-        self._painter.draw(frames, centers, headings)
+        self._painter.render(observations, centers, headings)
         if self.obs_mode != "dict":
-            return frames
+            return observations
         depth = [self._views[scene].depth[row : row + n, column : column + n] for scene, (row, column) in views]
-        return {"rgb": np.ascontiguousarray(frames[:, :3].transpose(0, 2, 3, 1)), "depth": np.stack(depth)[..., None]}
+        rgb = np.ascontiguousarray(observations[:, :3].transpose(0, 2, 3, 1))
+        return {"rgb": rgb, "depth": np.stack(depth)[..., None]}
 
     def factors(self) -> dict[str, NDArray[Any]]:
-        """The simulator's state behind the current observations; see the class."""
+        """The simulator's state that the current observations show; see the class."""
         goal = self._world.goal_positions(self._scene, self._field)
         return {
             "agent": goal + self._position,
@@ -342,7 +343,7 @@ class ScanNavEnv(SingleEnv):
     @property
     def content_hash(self) -> str:
         """sha256 over the maps and the agent's marker."""
-        # Behind BatchedVecEnv the batch is one row of another, which passes this on.
+        # Within BatchedVecEnv the batch is one row of another, which passes this on.
         return str(self.batch.content_hash)  # type: ignore[attr-defined]
 
     def oracle_action(self) -> int:
@@ -353,7 +354,7 @@ class ScanNavEnv(SingleEnv):
 def load_scene(scene: Scene) -> ScanMap:
     """The map of a scene.
 
-    :param scene: a map, a map's ``.npz`` file, a scan file, or the seed of a flat
+    :param scene: a map, a map's ``.npz`` file, a scan file, or the seed of an apartment
     :raises SceneError: for a file that cannot be used
     :raises ValueError: for anything else
     """
@@ -363,7 +364,7 @@ def load_scene(scene: Scene) -> ScanMap:
         return ScanMap.apartment(scene)
     if isinstance(scene, str | os.PathLike):
         return ScanMap.load(scene) if Path(scene).suffix.lower() == ".npz" else ScanMap.from_mesh(scene)
-    raise ValueError(f"a scene is a ScanMap, a file, or the seed of a flat, got {scene!r}")
+    raise ValueError(f"a scene is a ScanMap, a file, or the seed of an apartment, got {scene!r}")
 
 
 def _as_list(scenes: Any) -> list[Any]:
@@ -373,7 +374,7 @@ def _as_list(scenes: Any) -> list[Any]:
         return list(SEEDS)
     if isinstance(scenes, list | tuple):
         if not scenes:
-            raise ValueError("scenes is empty; give at least one, or None for the five flats")
+            raise ValueError("scenes is empty; give at least one, or None for the five apartments")
         return list(scenes)
     return [scenes]
 

@@ -1,4 +1,4 @@
-"""What scan files say about themselves, before and beside what trimesh makes of them."""
+"""What scan files declare, before and beside what trimesh makes of them."""
 
 import json
 import re
@@ -27,7 +27,7 @@ class SceneError(ValueError):
 
 
 def check_file(path: Path) -> Any:
-    """Refuse what can be told to be wrong without reading all of it.
+    """Refuse what is visibly wrong without reading all of it.
 
     :param path: of the scan
     :return: a glTF file's JSON part, else {}
@@ -109,7 +109,7 @@ def _color_texture(material: dict[str, Any]) -> dict[str, Any]:
 
 
 def texture_uri(header: dict[str, Any], reference: dict[str, Any]) -> str | None:
-    """Where the picture of a glTF texture lies.
+    """Where the image of a glTF texture lies.
 
     :param header: a file's JSON part
     :param reference: to a texture, or {}

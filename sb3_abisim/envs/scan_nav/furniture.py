@@ -1,20 +1,15 @@
-"""Furniture and textures for :mod:`~sb3_abisim.envs.scan_nav.apartment`.
+"""Furniture for :mod:`~sb3_abisim.envs.scan_nav.apartment`.
 
-A piece is a list of solids in its own frame: u along the wall that it stands at, v away from the wall, z up, in meters.
-``(u0, v0, u1, v1, z0, z1, texture)`` is a box; ``(u, v, radius, z0, z1, texture)`` an upright cylinder.
+A piece is a list of solids in coordinates of the piece: u along the wall that it stands at, v away from the wall, z up,
+in meters. ``(u0, v0, u1, v1, z0, z1, texture)`` is a box; ``(u, v, radius, z0, z1, texture)`` an upright cylinder.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage
 
 Solid = tuple[float | str, ...]
-_TEXTURE_PIXELS = 200
-# A texture covers a square of this side; then it repeats.
-TEXTURE_SIZE = 1.0  # m
 
 
 @dataclass(frozen=True)
@@ -31,52 +26,6 @@ class Piece:
     depth: float
     solids: list[Solid]
     front: float = 0.5
-
-
-def texture(kind: str, color: tuple[int, int, int], generator: np.random.Generator) -> NDArray[np.uint8]:
-    """A picture that repeats without a seam.
-
-    :param kind: "plain", "wood", "fabric", "stripes" or "stone"
-    :param color: its mean color
-    :param generator: draws its details
-    :return: uint8 (200, 200, 3)
-    """
-    n = _TEXTURE_PIXELS
-    smooth: dict[str, tuple[float, ...]] = {"wood": (1.2, 25), "stone": (6, 6), "fabric": (0.6, 0.6)}
-    noise = ndimage.gaussian_filter(generator.standard_normal((n, n)), smooth.get(kind, (2, 2)), mode="wrap")
-    strength = {"wood": 15, "stone": 12, "fabric": 12}.get(kind, 4)
-    light = noise / noise.std() * strength
-    if kind == "fabric":
-        light += 5 * ((np.arange(n)[:, None] // 2 + np.arange(n) // 2) % 2)
-    if kind == "stripes":
-        light += np.where((np.arange(n) // 20) % 2, 22, -22)
-    return np.asarray(np.clip(np.array(color) + light[..., None], 0, 255).astype(np.uint8))
-
-
-# Texture name: (kind, colors to choose from).
-TEXTURES: dict[str, tuple[str, tuple[tuple[int, int, int], ...]]] = {
-    "wall": ("plain", ((86, 82, 80),)),
-    "sill": ("stone", ((222, 220, 214),)),
-    "door": ("wood", ((232, 228, 220), (150, 104, 66), (110, 74, 48))),
-    "wood": ("wood", ((104, 66, 44), (84, 56, 42), (214, 206, 190))),
-    "dark": ("wood", ((70, 52, 42), (58, 58, 62))),
-    "white": ("plain", ((236, 236, 232),)),
-    "steel": ("plain", ((172, 176, 180),)),
-    "black": ("plain", ((34, 34, 38),)),
-    "screen": ("plain", ((22, 28, 40),)),
-    "water": ("plain", ((196, 216, 226),)),
-    "stone": ("stone", ((110, 108, 106), (60, 62, 64), (206, 200, 190))),
-    "sofa": ("fabric", ((92, 112, 130), (150, 76, 62), (104, 120, 84), (168, 160, 148), (70, 72, 84))),
-    "cushion": ("stripes", ((212, 170, 80), (200, 206, 210), (180, 90, 80))),
-    "sheet": ("fabric", ((240, 238, 232),)),
-    "duvet": ("stripes", ((104, 132, 168), (182, 130, 130), (134, 150, 120), (196, 186, 170))),
-    "seat": ("fabric", ((60, 76, 96), (120, 60, 52), (200, 190, 172), (48, 50, 54))),
-    "leaf": ("plain", ((58, 118, 58), (78, 132, 64))),
-    "pot": ("stone", ((172, 96, 64), (214, 210, 204))),
-    "paper": ("plain", ((244, 240, 226),)),
-    "red": ("plain", ((176, 58, 50),)),
-    "blue": ("plain", ((60, 90, 150),)),
-}
 
 
 def _chair(u: float, v: float, towards: tuple[int, int]) -> list[Solid]:
@@ -119,7 +68,7 @@ def single_bed(rng: np.random.Generator) -> Piece:
 
 
 def wardrobe(rng: np.random.Generator) -> Piece:
-    """Reaches through the cut: only its own top can be seen."""
+    """Reaches through the cut: only its top can be seen."""
     width = float(rng.choice([1.2, 1.8, 2.0]))
     return Piece(width, 0.6, [(0, 0, width, 0.6, 0, 2.2, "wood")], 0.7)
 

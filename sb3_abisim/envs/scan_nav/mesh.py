@@ -29,7 +29,7 @@ MIN_UP_RATIO = 1.25
 # A face is level where its unit normal's vertical part is above this.
 _LEVEL_NORMAL = 0.9
 _EXTENT = (1.0, 200.0)  # m
-_PICTURES = "export it again with PNG or JPEG textures of at most 8192 x 8192 pixels"  # Pillow refuses far larger ones
+_REEXPORT = "export it again with PNG or JPEG textures of at most 8192 x 8192 pixels"  # Pillow refuses far larger ones
 _COLORED_VERTEX = re.compile(rb"^v(?:[ \t]+[-+.\deE]+){6}[ \t\r]*$", re.MULTILINE)  # of an OBJ file
 _TEXTURE_VERTEX = re.compile(rb"^vt[ \t].*$", re.MULTILINE)
 
@@ -117,7 +117,7 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
 
     class Recorder(trimesh.resolvers.FilePathResolver):  # type: ignore[misc, unused-ignore]
         def get(self, name: str) -> bytes:
-            # glTF writes a space as %20. Exporters write paths of their own machine: then the file beside the scan.
+            # glTF writes a space as %20. Exporters write paths of another machine: then the file beside the scan.
             # Nothing outside of the scan's folder is read.
             folder = path.parent.resolve()
             candidates = [name.strip(), unquote(name.strip()), bare_name(name)]
@@ -129,7 +129,7 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
                     data = file.read_bytes()
                     if file.suffix.lower() == ".mtl":
                         libraries.append(data)
-                    if kind in ("obj", "ply") and file.suffix.lower() != ".mtl" and not _is_picture(data):
+                    if kind in ("obj", "ply") and file.suffix.lower() != ".mtl" and not _is_image(data):
                         damaged.append(candidate)
                     return data
             # Wherever it appears, it is noticed.
@@ -149,23 +149,27 @@ def _read(path: Path, header: Any) -> tuple[list[_Part], dict[str, str]]:
         raise SceneError(f"{path} cannot be read ({type(error).__name__}: {error}){absent}; export it again") from error
     warn_missing(path, missing)
     if damaged:
-        raise SceneError(f"{path}: the texture {damaged[0]} cannot be decoded; {_PICTURES}")
-    visuals = _visuals(scene)
-    n_textured = sum(
-        bool(texture) and "TEXCOORD_0" in primitive["attributes"] and texture_uri(header, texture) not in missing
-        for primitive, texture in primitives(header)
-    )
-    if (n_damaged := n_textured - sum(map(_shows_picture, visuals))) > 0:
-        raise SceneError(f"{path}: the textures of {n_damaged} of {n_textured} parts cannot be decoded; {_PICTURES}")
-    if n_bare := sum(_is_bare(visual) and not _has_lost(visual, lost) for visual in visuals):
-        warnings.warn(f"{path}: {n_bare} of {len(visuals)} parts have no color and are drawn gray", stacklevel=3)
+        raise SceneError(f"{path}: the texture {damaged[0]} cannot be decoded; {_REEXPORT}")
+    _check_colors(path, header, _visuals(scene), lost, missing)
     if not parts:
         found = "a point cloud" if any(len(getattr(g, "vertices", ())) for g in scene.geometry.values()) else "empty"
         raise SceneError(f"{path} is {found}: it has no faces; export the scan as a mesh of triangles")
     return parts, files
 
 
-def _is_picture(data: bytes) -> bool:
+def _check_colors(path: Path, header: Any, visuals: list[Any], lost: Callable[[Any], bool], missing: list[str]) -> None:
+    """Refuse textures that trimesh has passed over in silence, and warn of parts without any color."""
+    n_textured = sum(
+        bool(texture) and "TEXCOORD_0" in primitive["attributes"] and texture_uri(header, texture) not in missing
+        for primitive, texture in primitives(header)
+    )
+    if (n_damaged := n_textured - sum(map(_shows_texture, visuals))) > 0:
+        raise SceneError(f"{path}: the textures of {n_damaged} of {n_textured} parts cannot be decoded; {_REEXPORT}")
+    if n_bare := sum(_is_bare(visual) and not _has_lost(visual, lost) for visual in visuals):
+        warnings.warn(f"{path}: {n_bare} of {len(visuals)} parts have no color and are shown gray", stacklevel=4)
+
+
+def _is_image(data: bytes) -> bool:
     from PIL import Image
 
     try:
@@ -183,7 +187,7 @@ def _load(data: bytes, kind: str, load: Callable[..., Any], missing: list[str]) 
     bare = _TEXTURE_VERTEX.sub(b"", data)
     if bare != data:
         scene = load(io.BytesIO(data))
-        if missing or any(map(_shows_picture, _visuals(scene))):
+        if missing or any(map(_shows_texture, _visuals(scene))):
             return scene
     return load(io.BytesIO(bare), skip_materials=True)
 
@@ -192,7 +196,7 @@ def _visuals(scene: Any) -> list[Any]:
     return [geometry.visual for geometry in scene.geometry.values() if hasattr(geometry, "faces")]
 
 
-def _shows_picture(visual: Any) -> bool:
+def _shows_texture(visual: Any) -> bool:
     return visual.kind == "texture" and visual.uv is not None and _material(visual.material)[0] is not None
 
 
@@ -207,7 +211,7 @@ def _has_lost(visual: Any, lost: Callable[[Any], bool]) -> bool:
 
 
 def warn_missing(source: str | os.PathLike[str], names: Iterable[str]) -> None:
-    """Say which files of a scan are not there, if any.
+    """Warn which files of a scan are not there, if any.
 
     :param source: the scan
     :param names: of the files that it refers to
@@ -216,7 +220,7 @@ def warn_missing(source: str | os.PathLike[str], names: Iterable[str]) -> None:
     if missing := sorted(set(map(bare_name, names))):
         warnings.warn(
             f"{source} refers to {', '.join(missing)}, which is not there (in the scan's folder); what it covers gets "
-            "a flat color",
+            "a plain color",
             stacklevel=4,
         )
 
@@ -244,22 +248,22 @@ def _surface(visual: Any, faces: NDArray[np.int64], lost: Callable[[Any], bool])
             pixels = np.asarray(image.convert("RGB"), dtype=np.float32) * (factor / 255)
             texture = np.rint(pixels).astype(np.uint8)
             return Surface(len(faces), texture, np.asarray(visual.uv, dtype=np.float32)[faces])
-        # An untextured material has its own color, unless it has lost its texture.
+        # An untextured material has a color, unless it has lost its texture.
         # glTF multiplies it by the vertices' colors.
         colors = visual.vertex_attributes.get("color")
         if colors is not None and not lost(visual.material):
             largest = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0
             shown = np.asarray(colors, dtype=np.float32)[:, :3] / np.float32(largest) * factor
             return Surface(len(faces), None, shown[faces])
-        flat = np.array(MISSING_COLOR if lost(visual.material) else factor, dtype=np.float32)
-        return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
+        plain = np.array(MISSING_COLOR if lost(visual.material) else factor, dtype=np.float32)
+        return Surface(len(faces), None, np.broadcast_to(plain, (len(faces), 3, 3)))
     if visual.kind == "vertex":
         return Surface(len(faces), None, np.asarray(visual.vertex_colors, dtype=np.float32)[faces][..., :3])
     if visual.kind == "face":
         colors = np.asarray(visual.face_colors, dtype=np.float32)[:, None, :3]
         return Surface(len(faces), None, np.broadcast_to(colors, (len(faces), 3, 3)))
-    flat = np.array(MISSING_COLOR, dtype=np.float32)
-    return Surface(len(faces), None, np.broadcast_to(flat, (len(faces), 3, 3)))
+    plain = np.array(MISSING_COLOR, dtype=np.float32)
+    return Surface(len(faces), None, np.broadcast_to(plain, (len(faces), 3, 3)))
 
 
 def _material(material: Any) -> tuple[Any, NDArray[np.float32]]:
@@ -271,7 +275,7 @@ def _material(material: Any) -> tuple[Any, NDArray[np.float32]]:
         linear = np.asarray(factor, dtype=np.float32)[:3] / 255
         # glTF's factors are linear light.
         return image, (255 * np.clip(linear, 0, 1) ** (1 / 2.2)).astype(np.float32)
-    # trimesh gives coordinates without a material a gray picture of its own, which has no file format.
+    # trimesh gives coordinates without a material a gray image, which has no file format.
     if material.image is not None and material.image.format:
         # Many OBJ exporters write a gray or black Kd beside the texture and mean the texture alone.
         return material.image, np.full(3, 255, dtype=np.float32)

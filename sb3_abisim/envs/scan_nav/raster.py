@@ -67,7 +67,7 @@ def fragments(corners: NDArray[np.float64], height: int, width: int) -> Iterator
             f, r = face[part][owners], row[part][owners]
             column += begin[part][owners]
             z = tri[f, 0, 2] + slope_x[f] * (column + 0.5 - tri[f, 0, 0]) + slope_y[f] * (r + 0.5 - tri[f, 0, 1])
-            # Steep triangles would leave their own corners by rounding.
+            # Steep triangles would leave their corners by rounding.
             yield f, r * width + column, np.clip(z, lowest[f], highest[f]).astype(np.float32)
 
 

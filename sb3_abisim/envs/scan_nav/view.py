@@ -1,4 +1,4 @@
-"""Frames of ScanNav: parts of one large picture, with the agent drawn on them."""
+"""Observations of ScanNav: parts of a map, with the agent rendered on them."""
 
 import math
 
@@ -12,9 +12,9 @@ MAX_DEPTH = 10.0  # m, Habitat's
 YELLOW, MAGENTA = (255, 214, 0), (255, 0, 200)
 _OCTAGON = tuple((0.13 * math.cos(a), 0.13 * math.sin(a)) for a in (math.pi * (k + 0.5) / 4 for k in range(8)))
 # The agent's marker: convex parts, a later one over an earlier. Of each its color and its corners in m, ahead of the
-# agent's center and to its left, counter-clockwise. The body of the arrow is as good as round, its nose has a color of
-# its own. Which way a plain triangle turns can be seen from its direction modulo 120 degrees: inverse dynamics had
-# no use for more, and agents on such encoders did not know ahead from behind (docs/scan_nav.md).
+# agent's center and to its left, counter-clockwise. The body of the arrow is as good as round, its nose has another
+# color. Which way a plain triangle turns can be seen from its direction modulo 120 degrees: inverse dynamics had no use
+# for more, and agents on such encoders did not know front from back (docs/scan_nav.md).
 MARKERS: dict[str, tuple[tuple[tuple[int, int, int], tuple[tuple[float, float], ...]], ...]] = {
     "arrow": ((YELLOW, _OCTAGON), (MAGENTA, ((0.24, 0.06), (0.1, 0.06), (0.1, -0.06), (0.24, -0.06)))),
     "box": ((YELLOW, ((0.14, 0.14), (-0.14, 0.14), (-0.14, -0.14), (0.14, -0.14))),),
@@ -52,44 +52,46 @@ class SceneView:
         self.depth = padded[4].astype(np.float32)
 
 
-def area_means(picture: NDArray[np.float64], ratio: float) -> NDArray[np.float64]:
-    """Means over squares of ``ratio`` x ``ratio`` pixels, which need not be a whole number; beyond the picture is 0.
+def area_means(channel: NDArray[np.float64], ratio: float) -> NDArray[np.float64]:
+    """Means over squares of ``ratio`` x ``ratio`` pixels, which need not be a whole number; beyond the channel is 0.
 
-    :param picture: (height, width)
+    :param channel: (height, width)
     :param ratio: size of a square, in pixels
     :return: (ceil(height / ratio), ceil(width / ratio))
     """
     for _ in range(2):
-        total = np.pad(np.cumsum(picture, axis=0), ((1, 1), (0, 0)), mode="edge")
+        total = np.pad(np.cumsum(channel, axis=0), ((1, 1), (0, 0)), mode="edge")
         total[0] = 0
-        n = len(picture)
+        n = len(channel)
         edges = np.minimum(np.arange(int(np.ceil(n / ratio - 1e-9)) + 1) * ratio, n)
         whole = edges.astype(np.int64)
         at_edges = total[whole] + (edges - whole)[:, None] * (total[whole + 1] - total[whole])
-        picture = (np.diff(at_edges, axis=0) / ratio).T
-    return picture
+        channel = (np.diff(at_edges, axis=0) / ratio).T
+    return channel
 
 
 class MarkerPainter:
-    """Draws the agent, convex polygons that turn with it, into the colors of frames.
+    """Renders the agent, convex polygons that turn with it, into the colors of observations.
 
     :param marker: a key of :data:`MARKERS`
-    :param image_size: of the frames
+    :param image_size: of the observations
     :param pitch: meters per pixel
     """
 
     def __init__(self, marker: str, image_size: int, pitch: float) -> None:
         self._parts = [_PartPainter(color, corners, image_size, pitch) for color, corners in MARKERS[marker]]
 
-    def draw(self, frames: NDArray[np.uint8], centers: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
-        """Draw one marker into each frame, in place.
+    def render(
+        self, observations: NDArray[np.uint8], centers: NDArray[np.float64], headings: NDArray[np.float64]
+    ) -> None:
+        """Render one marker into each observation, in place.
 
-        :param frames: contiguous, (n, 3 or more, image_size, image_size); the first three channels are drawn on
+        :param observations: contiguous, (n, 3 or more, image_size, image_size); the first three channels change
         :param centers: (column, row) in pixels, at least the marker's radius and two pixels from the border
         :param headings: in degrees, 0 is up and 90 is left
         """
         for part in self._parts:
-            part.draw(frames, centers, headings)
+            part.render(observations, centers, headings)
 
 
 class _PartPainter:
@@ -110,7 +112,9 @@ class _PartPainter:
         self._where = np.arange(3)[:, None, None] * image_size**2 + steps
         self._color = np.array(color, dtype=np.uint32)[:, None, None]
 
-    def draw(self, frames: NDArray[np.uint8], centers: NDArray[np.float64], headings: NDArray[np.float64]) -> None:
+    def render(
+        self, observations: NDArray[np.uint8], centers: NDArray[np.float64], headings: NDArray[np.float64]
+    ) -> None:
         corner = np.floor(centers - self._radius).astype(np.int64)
         points = corner[:, :, None] + self._points - centers[:, :, None]
         angle = np.deg2rad(headings)[:, None]
@@ -124,8 +128,8 @@ class _PartPainter:
         for k in range(1, len(self._offsets)):
             inside &= across[:, k, None, :] >= -down[:, k, :, None]
         share = _count_samples(inside)
-        starts = corner[:, 1] * self._image_size + corner[:, 0] + np.arange(len(frames)) * frames[0].size
-        flat = frames.reshape(-1)
+        starts = corner[:, 1] * self._image_size + corner[:, 0] + np.arange(len(observations)) * observations[0].size
+        flat = observations.reshape(-1)
         where = starts[:, None, None, None] + self._where
         below, share, whole = flat[where].astype(np.uint32), share[:, None], SAMPLES**2
         flat[where] = (below * (whole - share) + self._color * share + whole // 2) // whole

@@ -15,12 +15,12 @@ from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.map import ScanMap
 
 NODE = 0.05  # m between neighboring nodes
-# A goal is used if this share of points drawn in its view are starts, so that drawing one ends soon.
+# A goal is used if this share of points sampled in its view are starts, so that sampling one ends soon.
 MIN_START_SHARE = 0.005
 # Places of a scene that are tried as goals before it is refused.
 MAX_GOALS_TRIED = 300
 _SUBSTEP = NODE / 2
-_DRAWS = 16
+_N_SAMPLES = 16
 _CORNERS = np.array(((0, 0), (0, 1), (1, 0), (1, 1)))
 # (rows, columns) of each way, and the nodes that it passes by and that must be free as well.
 _WAYS: tuple[tuple[tuple[int, int], tuple[tuple[int, int], ...]], ...] = (
@@ -113,20 +113,20 @@ class StartRule:
 class ScanWorld:
     """Goals of several scenes with their fields, and what can be asked about positions in them.
 
-    Field ``scene * n_goals + k`` is that of the scene's goal k, computed when it is first needed; the last ``n_own``
-    fields belong to goals that are placed by hand.
+    Field ``scene * n_goals + k`` is that of the scene's goal k, computed when it is first needed; the last
+    ``n_custom`` fields belong to goals that are placed by hand.
 
     :param scans: the scenes' maps
     :param pitch: m per pixel of the observations; goals lie on corners of these pixels
     :param reach: half the side of the square around a goal that belongs to it, in m
     :param n_goals: per scene
-    :param n_own: number of further fields
+    :param n_custom: number of further fields
     :param rule: for starts
     :raises SceneError: for a scene without a goal that has enough starts
     """
 
     def __init__(
-        self, scans: list[ScanMap], pitch: float, reach: float, n_goals: int, n_own: int, rule: StartRule
+        self, scans: list[ScanMap], pitch: float, reach: float, n_goals: int, n_custom: int, rule: StartRule
     ) -> None:
         self.scans, self.pitch, self.n_goals, self.rule = scans, pitch, n_goals, rule
         self.half = int(reach / NODE)
@@ -137,8 +137,8 @@ class ScanWorld:
         self._straight = np.hypot(offsets[:, None], offsets)
         self._origins = np.array([scan.origin for scan in scans])
         self._places = [_places(scan, pitch) for scan in scans]
-        n_fields = len(scans) * n_goals + n_own
-        self.own = np.arange(n_fields - n_own, n_fields)
+        n_fields = len(scans) * n_goals + n_custom
+        self.custom_fields = np.arange(n_fields - n_custom, n_fields)
         # Memory that is never written is never taken.
         self._fields = np.empty((n_fields, self._across, self._across), dtype=np.float32)
         self._flat = self._fields.reshape(-1)
@@ -175,7 +175,7 @@ class ScanWorld:
         )
 
     def place_goal(self, scene: int, goal: NDArray[np.float64], copies: NDArray[np.int64]) -> None:
-        """Make a point the goal of some copies' own fields.
+        """Make a point the goal of the custom fields of some copies.
 
         :param scene: index
         :param goal: x and y in m, in the scan's coordinates; moved to the nearest corner of a pixel
@@ -186,8 +186,8 @@ class ScanWorld:
         distances = self._compute(scene, corner)
         if not np.isfinite(distances[self._middle, self._middle]):
             raise ValueError(f"the goal {goal.tolist()} is not on the walkable floor of {self.scans[scene].source}")
-        own = self.own[copies]
-        self._fields[own], self.corners[own] = distances, corner
+        fields = self.custom_fields[copies]
+        self._fields[fields], self.corners[fields] = distances, corner
 
     def goal_positions(self, scenes: NDArray[np.int64], fields: NDArray[np.int64]) -> NDArray[np.float64]:
         """x and y of goals in m, in the scans' coordinates, (n, 2).
@@ -217,30 +217,30 @@ class ScanWorld:
         return np.pad(self._grid.distances(free), 1, constant_values=np.inf)
 
     def _start_share(self, distances: NDArray[np.float32]) -> float:
-        """The probability that a point drawn uniformly in the view becomes a start."""
+        """The probability that a point sampled uniformly in the view becomes a start."""
         return float(self.rule.weights(distances, self._straight).mean())
 
     def has_starts(self, field: int) -> bool:
-        """Whether :meth:`draw_start` ends soon.
+        """Whether :meth:`sample_start` ends soon.
 
         :param field: index
         """
         return self._start_share(self._fields[field]) >= MIN_START_SHARE
 
-    def draw_start(self, field: int, generator: np.random.Generator) -> NDArray[np.float64]:
+    def sample_start(self, field: int, generator: np.random.Generator) -> NDArray[np.float64]:
         """A start, uniformly over all points that the rule keeps.
 
         :param field: index of one that has starts
-        :param generator: draws it
+        :param generator: samples it
         :return: (2,)
         """
-        reach, fields = (self.half + 0.5) * NODE, np.full(_DRAWS, field)
+        reach, fields = (self.half + 0.5) * NODE, np.full(_N_SAMPLES, field)
         while True:
-            draws = generator.random((_DRAWS, 3))
-            positions = (2 * draws[:, :2] - 1) * reach
+            samples = generator.random((_N_SAMPLES, 3))
+            positions = (2 * samples[:, :2] - 1) * reach
             distances = np.where(self.is_open(fields, positions), self.distances(fields, positions), np.inf)
             weights = self.rule.weights(distances, np.hypot(positions[:, 0], positions[:, 1]))
-            taken = np.flatnonzero(draws[:, 2] < weights)
+            taken = np.flatnonzero(samples[:, 2] < weights)
             if len(taken):
                 return np.asarray(positions[taken[0]])
 
@@ -338,7 +338,7 @@ class ScanWorld:
 
 
 def _places(scan: ScanMap, pitch: float) -> NDArray[np.int64]:
-    """Walkable corners of observation pixels, (n, 2) rows and columns, in an order drawn once and for all."""
+    """Walkable corners of observation pixels, (n, 2) rows and columns, in an order sampled once and for all."""
     walkable, ratio = scan.walkable, pitch / scan.meters_per_pixel
     rows, columns = (
         np.minimum((np.arange(int(n / ratio) + 1) * ratio).astype(np.int64), n - 1) for n in walkable.shape

@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sb3_abisim._version import __version__
+from sb3_abisim.benchmark.graph import build
+from sb3_abisim.benchmark.jobs.job import Job
+from sb3_abisim.benchmark.jobs.launch import JobError
 from sb3_abisim.benchmark.jobs.local import run_jobs
 from sb3_abisim.benchmark.jobs.ray import RayEngine, _execute
-from sb3_abisim.benchmark.plan import Job, Plan, build
+from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.benchmark.sweep import sweep
 
 # Ray's own programs leave sockets and files open.
@@ -24,9 +28,6 @@ PLAN = Plan(
 
 
 def test_a_node_of_another_version_or_without_the_folder_is_refused(tmp_path: Path) -> None:
-    from sb3_abisim._version import __version__
-    from sb3_abisim.benchmark.jobs.job import JobError
-
     job = build(PLAN)[0].to_json()
     with pytest.raises(JobError, match=r"has sb3_abisim .* runs with 0\.0\.1"):
         _execute(str(tmp_path), "token", "0.0.1", job, 1)
@@ -35,14 +36,14 @@ def test_a_node_of_another_version_or_without_the_folder_is_refused(tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
-def test_no_cells_at_a_time_are_refused() -> None:
+def test_no_jobs_at_a_time_are_refused() -> None:
     pytest.importorskip("ray")
     with pytest.raises(ValueError, match="n_jobs must be at least 1, got 0"):
         RayEngine(n_jobs=0)
 
 
 @pytest.mark.slow
-def test_a_killed_node_costs_its_cell_another_start_and_nothing_else(
+def test_a_killed_node_costs_its_job_another_start_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("ray")
@@ -77,7 +78,7 @@ def test_a_killed_node_costs_its_cell_another_start_and_nothing_else(
         assert engine.n_slots == 2
         assert run_jobs(tmp_path, jobs, engine, progress=False) == {}
         assert killed and len(list_running) == 2
-        starts = [(tmp_path / "logs" / f"{job.name}.log").read_text().count("$ python -m") for job in jobs]
+        starts = [(tmp_path / "logs" / f"{job.name}.log").read_text().count("$ sb3-abisim train") for job in jobs]
         assert sorted(starts) == [1, 2], "the job on the dead node starts again, the other does not"
         for job in jobs:
             evaluations = np.load(tmp_path / job.output / "evaluations.npz")

@@ -38,7 +38,7 @@ def test_common_steps() -> None:
         statistics.on_common_steps([curves[0], (np.array([40, 50]), np.zeros(2))])
 
 
-def test_a_single_good_evaluation_is_no_arrival() -> None:
+def test_a_single_good_evaluation_reaches_no_threshold() -> None:
     steps = np.arange(1, 9) * 100
     values = np.array([0.0, 9.0, 0.0, 0.0, 5.0, 6.0, 7.0, 8.0])
     assert statistics.WINDOW == 3
@@ -65,6 +65,25 @@ def test_ratio_and_its_bootstrap() -> None:
     assert ratio.reached == (1, 1)
 
 
+def test_the_bootstrap_resamples_the_runs_of_both_methods(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All resamples by hand: either of the two outermost ratios has a chance of 1/16, more than the 2.5 % cut off."""
+    monkeypatch.setattr(statistics, "N_RESAMPLES", 4000)
+    reference, baseline = (100.0, 200.0), (300.0, 600.0)
+    means = [[(a + b) / 2 for a, b in itertools.product(steps, steps)] for steps in (reference, baseline)]
+    ratios = sorted(a / b for a, b in itertools.product(*means))
+    ratio = statistics.steps_ratio(np.array(reference), np.array(baseline), (1000, 1000))
+    assert (ratio.low, ratio.high) == pytest.approx((ratios[0], ratios[-1])) == (100 / 600, 200 / 300)
+    assert ratio.value == pytest.approx(150 / 450)
+    # Resampled alone, either method gives a narrower interval, and pairs of runs none at all.
+    assert statistics.steps_ratio(np.array(reference), np.full(2, 450.0), (1000, 1000)).low == pytest.approx(100 / 450)
+    assert statistics.steps_ratio(np.full(2, 150.0), np.array(baseline), (1000, 1000)).low == pytest.approx(150 / 600)
+
+
+def test_a_censored_run_counts_in_the_resamples() -> None:
+    ratio = statistics.steps_ratio(np.array([100.0, 100.0]), np.array([300.0, np.nan]), (1000, 1000))
+    assert (ratio.low, ratio.value, ratio.high) == pytest.approx((100 / 1000, 100 / 650, 100 / 300))
+
+
 @pytest.mark.parametrize(
     ("reference", "baseline", "bound", "value"),
     [
@@ -74,7 +93,7 @@ def test_ratio_and_its_bootstrap() -> None:
         ([100, 300], [np.nan, np.nan], "<=", 0.2),
     ],
 )
-def test_runs_that_never_arrive_make_a_bound(reference: list, baseline: list, bound: str, value: float) -> None:
+def test_censored_runs_make_a_bound(reference: list, baseline: list, bound: str, value: float) -> None:
     ratio = statistics.steps_ratio(np.array(reference, float), np.array(baseline, float), (1000, 1000))
     assert ratio.bound == bound and ratio.value == pytest.approx(value)
 
@@ -92,7 +111,7 @@ def test_a_longer_baseline_makes_the_bound_closer(reference: list, baseline: lis
     assert ratio.bound == bound and ratio.value == pytest.approx(value)
 
 
-def test_no_ratio_without_arrivals_or_interval_without_runs() -> None:
+def test_no_ratio_where_all_are_censored_or_interval_without_runs() -> None:
     assert statistics.steps_ratio(np.array([100, np.nan]), np.array([1600, np.nan]), (1000, 4000)).steps == (550, 1000)
     nobody = statistics.steps_ratio(np.full(3, np.nan), np.full(3, np.nan), (1000, 1000))
     assert np.isnan(nobody.value) and nobody.reached == (0, 0)

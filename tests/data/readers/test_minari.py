@@ -1,3 +1,5 @@
+"""Exchange with Minari: lossless both ways, and nothing that a stranger's file names is run."""
+
 import builtins
 import json
 from pathlib import Path
@@ -8,11 +10,13 @@ import numpy as np
 import pytest
 
 from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data import writer as writer_module
 from sb3_abisim.data.collect import collect
+from sb3_abisim.data.command import main
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED
-from sb3_abisim.data.readers import minari as minari_io
-from sb3_abisim.data.readers.minari import export_dataset, import_dataset, main
+from sb3_abisim.data.readers import minari as reader_module
+from sb3_abisim.data.readers.minari import export_dataset, import_dataset
 
 minari = pytest.importorskip("minari")
 h5py = pytest.importorskip("h5py")
@@ -78,7 +82,7 @@ def episode(frames: np.ndarray, terminated: bool = False, truncated: bool = Fals
     } | changes
 
 
-def pictures(n: int, shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
+def make_frames(n: int, shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(256, size=(n, *shape), dtype=np.uint8)
 
 
@@ -95,10 +99,10 @@ def test_round_trip_is_lossless(ours: Path, tmp_path: Path) -> None:
     assert after.meta["source"]["minari"] == "index/random-v0"
 
 
-def test_pictures_large_enough_for_jpeg_stay_exact(tmp_path: Path) -> None:
-    """Minari calls pictures of 32 x 32 and more images, and would store them as JPEG."""
+def test_frames_large_enough_for_jpeg_stay_exact(tmp_path: Path) -> None:
+    """Minari takes frames of 32 x 32 and more for images, and would store them as JPEG."""
     for name, shape in (("first", (3, 40, 48)), ("last", (40, 48, 3))):
-        frames = pictures(6, shape)
+        frames = make_frames(6, shape)
         space = gym.spaces.Box(0, 255, shape, np.uint8)
         make_minari(f"{name}-v0", [episode(frames, terminated=True)], space, jpeg_encoding=False)
         import_dataset(f"{name}-v0", tmp_path / name)
@@ -133,7 +137,7 @@ def test_what_minari_users_see(ours: Path) -> None:
 
 def test_channels_last_is_transposed_and_back(tmp_path: Path) -> None:
     shape = (4, 5, 3)
-    frames = pictures(4, shape)
+    frames = make_frames(4, shape)
     space = gym.spaces.Box(0, 255, shape, np.uint8)
     make_minari("hwc-v0", [episode(frames, terminated=True)], space, jpeg_encoding=False)
     import_dataset("hwc-v0", tmp_path / "d")
@@ -153,7 +157,7 @@ def test_ends_and_continuous_actions_of_a_foreign_dataset(tmp_path: Path) -> Non
     actions = np.random.default_rng(0).uniform(-1, 1, size=(3, 2)).astype(np.float32)
     shape = (3, 4, 5)
     endings = [{"terminated": True}, {"truncated": True}, {}, {"terminated": True, "truncated": True}]
-    episodes = [episode(pictures(4, shape, i), actions=actions, **ends) for i, ends in enumerate(endings)]
+    episodes = [episode(make_frames(4, shape, i), actions=actions, **ends) for i, ends in enumerate(endings)]
     make_minari("box-v0", episodes, gym.spaces.Box(0, 255, shape, np.uint8), action_space=space, jpeg_encoding=False)
     import_dataset("box-v0", tmp_path / "d")
     dataset = TransitionDataset(tmp_path / "d")
@@ -166,18 +170,18 @@ def test_ends_and_continuous_actions_of_a_foreign_dataset(tmp_path: Path) -> Non
 
 def test_large_imports_are_cut_into_shards(ours: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export_dataset(ours, "index-v0")
-    monkeypatch.setattr(minari_io, "SHARD_TRANSITIONS", 60)
+    monkeypatch.setattr(writer_module, "SHARD_TRANSITIONS", 60)
     import_dataset("index-v0", tmp_path / "back")
     after = TransitionDataset(tmp_path / "back")
     assert len(after.meta["shards"]) == 4
     assert_same_data(TransitionDataset(ours), after)
 
 
-def test_jpeg_pictures_are_announced(tmp_path: Path) -> None:
+def test_jpeg_images_are_announced(tmp_path: Path) -> None:
     shape = (40, 48, 3)
     space = gym.spaces.Box(0, 255, shape, np.uint8)
-    make_minari("jpeg-v0", [episode(pictures(4, shape), terminated=True)], space)
-    with pytest.warns(UserWarning, match="jpeg-v0 holds JPEG pictures"):
+    make_minari("jpeg-v0", [episode(make_frames(4, shape), terminated=True)], space)
+    with pytest.warns(UserWarning, match="jpeg-v0 holds JPEG images"):
         import_dataset("jpeg-v0", tmp_path / "d")
 
 
@@ -193,7 +197,7 @@ def test_damage_in_the_minari_file_is_noticed(ours: Path, tmp_path: Path, store:
 def test_an_export_that_is_stopped_leaves_nothing_or_nothing_that_is_taken_for_whole(
     ours: Path, tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plain, kept = minari_io._to_episode, []
+    plain, kept = reader_module._to_episode, []
 
     def stopped(*args: object) -> object:
         kept.append(args)
@@ -201,7 +205,7 @@ def test_an_export_that_is_stopped_leaves_nothing_or_nothing_that_is_taken_for_w
             raise KeyboardInterrupt
         return plain(*args)
 
-    monkeypatch.setattr(minari_io, "_to_episode", stopped)
+    monkeypatch.setattr(reader_module, "_to_episode", stopped)
     with pytest.raises(KeyboardInterrupt):
         export_dataset(ours, "index-v0")
     assert not (store / "index-v0").exists()
@@ -218,12 +222,12 @@ def test_an_export_that_is_stopped_leaves_nothing_or_nothing_that_is_taken_for_w
     original = storage.update_metadata
 
     def update_metadata(self: object, metadata: dict) -> None:
-        if metadata.get(minari_io.METADATA_KEY, {}).get("content_sha256"):
+        if metadata.get(reader_module.METADATA_KEY, {}).get("content_sha256"):
             raise KeyboardInterrupt
         original(self, metadata)
 
     monkeypatch.setattr(storage, "update_metadata", update_metadata)
-    monkeypatch.setattr(minari_io, "_to_episode", plain)
+    monkeypatch.setattr(reader_module, "_to_episode", plain)
     with pytest.raises(KeyboardInterrupt):
         export_dataset(ours, "whole-v0")
     with pytest.raises(ValueError, match=r"was not exported to its end; .*`minari delete whole-v0`"):
@@ -265,13 +269,13 @@ SPACE = gym.spaces.Box(0, 255, SHAPE, np.uint8)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"actions": np.array([0, 1, 7])}, "not in its action space"),
+        ({"actions": np.array([0, 1, 7])}, "not in the action space"),
         ({"terminations": np.array([False, True, False])}, "goes on after an end"),
-        ({"observations": pictures(3, SHAPE)}, "n transitions need n \\+ 1 observations"),
+        ({"observations": make_frames(3, SHAPE)}, "n transitions need n \\+ 1 observations"),
     ],
 )
 def test_episodes_that_do_not_fit_are_named(tmp_path: Path, changes: dict, message: str) -> None:
-    episodes = [episode(pictures(4, SHAPE)), episode(pictures(4, SHAPE)) | changes]
+    episodes = [episode(make_frames(4, SHAPE)), episode(make_frames(4, SHAPE)) | changes]
     make_minari("bad-v0", episodes, SPACE, jpeg_encoding=False)
     with pytest.raises(ValueError, match=f"episode 1 of Minari dataset bad-v0 .*{message}"):
         import_dataset("bad-v0", tmp_path / "d")
@@ -280,10 +284,10 @@ def test_episodes_that_do_not_fit_are_named(tmp_path: Path, changes: dict, messa
 def test_spaces_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     vectors = gym.spaces.Box(-1, 1, (5,), np.float32)
     make_minari("vector-v0", [episode(np.zeros((4, 5), np.float32))], vectors)
-    with pytest.raises(ValueError, match="only uint8 pictures"):
+    with pytest.raises(ValueError, match="only uint8 images"):
         import_dataset("vector-v0", tmp_path / "d")
     float64 = gym.spaces.Box(-1, 1, (2,), np.float64)
-    make_minari("f64-v0", [episode(pictures(4, SHAPE), actions=np.zeros((3, 2)))], SPACE, action_space=float64)
+    make_minari("f64-v0", [episode(make_frames(4, SHAPE), actions=np.zeros((3, 2)))], SPACE, action_space=float64)
     with pytest.raises(ValueError, match="float32 Box"):
         import_dataset("f64-v0", tmp_path / "d")
     assert not (tmp_path / "d").exists()
@@ -292,24 +296,26 @@ def test_spaces_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 def test_commands(ours: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     main(["export", str(ours), "index/random-v0"])
     assert "rewards were not recorded" in capsys.readouterr().out
-    main(["import", "index/random-v0", str(tmp_path / "back")])
+    main(["import", "minari", "index/random-v0", "-o", str(tmp_path / "back")])
     assert "rewards were dropped" in capsys.readouterr().out
     for arguments, message in (
         (["export", str(ours), "index/random-v0"], "already exists"),
         (["export", str(tmp_path / "nothing"), "other-v0"], "nothing is not a folder"),
-        (["import", "index/random-v0", str(tmp_path / "back")], "already holds"),
-        (["import", "absent-v0", str(tmp_path / "d")], "minari download absent-v0"),
-        (["import", "index/random-v0", str(ours)], "begun with other arguments"),
+        (["import", "minari", "index/random-v0", "-o", str(tmp_path / "back")], "already holds"),
+        (["import", "minari", "absent-v0", "-o", str(tmp_path / "d")], "minari download absent-v0"),
+        (["import", "minari", "index/random-v0", "-o", str(ours)], "begun with other arguments"),
+        (["import", "hdf4", "index/random-v0", "-o", str(tmp_path / "d")], "unknown reader 'hdf4'; known are minari"),
     ):
         with pytest.raises(SystemExit) as exit_info:
             main(arguments)
         assert exit_info.value.code == 2
-        assert message in capsys.readouterr().err
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"sb3-abisim data {arguments[0]}: error: ") and message in line
 
 
 @pytest.mark.parametrize("name", ["nav2d", "bad id", "-v0", "a-v"])
 def test_a_name_that_minari_cannot_have_leaves_nothing_behind(ours: Path, store: Path, name: str) -> None:
-    with pytest.raises(ValueError, match="is no name of a Minari dataset"):
+    with pytest.raises(ValueError, match="is not a name of a Minari dataset"):
         export_dataset(ours, name)
     assert not store.exists() or not list(store.iterdir())
     assert minari.list_local_datasets() == {}

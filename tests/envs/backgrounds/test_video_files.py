@@ -1,7 +1,7 @@
-"""A user's own videos: finding them, and dividing them into two sides."""
+"""Finding custom videos, and dividing them into two sides."""
 
 import pytest
-from video_inputs import both, own_cache, shown, videos_folder, write_frames, write_video  # noqa: F401
+from video_inputs import both, empty_cache, shown, videos_folder, write_frames, write_video  # noqa: F401
 
 from sb3_abisim.envs.backgrounds.load import load_backgrounds
 from sb3_abisim.envs.backgrounds.video_files import find_sources, natural_key, split_sources
@@ -37,14 +37,14 @@ class TestSplit:
         hashes = [{f.tobytes() for i in range(side.n_clips) for f in shown(side, i)} for side in both(folder)]
         assert [len(side) for side in hashes] == [80, 20] and not hashes[0] & hashes[1]
 
-    @pytest.mark.parametrize("unseen", ["val", "valid", "validation", "test"])
-    def test_other_names_of_the_unseen_side(self, folder, unseen):
-        for name in ("train/0.mp4", f"{unseen}/0.mp4", f"{unseen}/1.mp4"):
+    @pytest.mark.parametrize("side", ["val", "valid", "validation", "test"])
+    def test_other_names_of_the_eval_side(self, folder, side):
+        for name in ("train/0.mp4", f"{side}/0.mp4", f"{side}/1.mp4"):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).touch()
         sides = listed(folder)
         assert sorted(sides["train"]) == ["train/0.mp4"]
-        assert sorted(sides["eval"]) == [f"{unseen}/0.mp4", f"{unseen}/1.mp4"]
+        assert sorted(sides["eval"]) == [f"{side}/0.mp4", f"{side}/1.mp4"]
 
     def test_links_to_folders_are_followed_once(self, folder, tmp_path):
         write_frames(tmp_path / "disk" / "far", 1)
@@ -61,15 +61,15 @@ class TestSplit:
         assert sorted(sides["train"]) == ["train/a/0.mp4", "train/b.mp4"]
         assert sorted(sides["eval"]) == ["eval/a/0.mp4", "eval/c.mp4", "eval/d.mp4"]
 
-    def test_davis_root_uses_its_own_lists(self, folder):
+    def test_davis_root_defines_the_split(self, folder):
         lists = folder / "ImageSets" / "2017"
         lists.mkdir(parents=True)
         (lists / "train.txt").write_text("bear\nboat\n\n")
         (lists / "val.txt").write_text("cows\n")
         for seed, name in enumerate(("bear", "boat", "cows", "unlisted")):
             write_frames(folder / "JPEGImages" / "480p" / name, seed, range(25), "{:05d}.jpg")
-        train, unseen = both(folder)
-        assert train.names == ("bear", "boat") and unseen.names == ("cows",)
+        train, evaluation = both(folder)
+        assert train.names == ("bear", "boat") and evaluation.names == ("cows",)
         assert train.lengths.tolist() == [25, 25]
         (lists / "val.txt").write_text("camel\n")
         with pytest.raises(ValueError, match=r"val\.txt lists 'camel'"):
@@ -91,11 +91,11 @@ class TestSplit:
         sides = {source.name: source.split for source in find_sources(folder)}
         assert sides == {"Training/a.mp4": "train", "VAL/a.mp4": "eval", "VAL/b.mp4": "eval"}
 
-    def test_frames_beside_a_film_are_not_dropped(self, folder):
+    def test_frames_beside_a_video_are_not_dropped(self, folder):
         for i in range(5):
             (folder / f"{i}.png").touch()
         (folder / "preview.mp4").touch()
-        with pytest.raises(ValueError, match=r"holds 5 pictures beside preview\.mp4"):
+        with pytest.raises(ValueError, match=r"holds 5 images beside preview\.mp4"):
             find_sources(folder)
 
     def test_one_group_leaves_a_side_empty(self, folder):
@@ -112,6 +112,22 @@ class TestSplit:
     def test_the_same_content_on_both_sides(self, folder):
         write_frames(folder / "a"), write_frames(folder / "b")
         with pytest.raises(ValueError, match=r"[ab] \(train\) and .*[ab] \(eval\) have the same content; remove one"):
+            load_backgrounds(folder)
+
+
+class TestMistakes:
+    def test_missing_folder_and_file_instead_of_folder(self, folder):
+        with pytest.raises(ValueError, match=r"videos.nothing does not exist.*correct the path"):
+            load_backgrounds(folder / "nothing")
+        with pytest.raises(ValueError, match=r"a\.mp4 is a file; give the folder"):
+            load_backgrounds(write_video(folder / "a.mp4"))
+
+    def test_no_videos_says_what_was_found(self, folder):
+        with pytest.raises(ValueError, match="found an empty folder"):
+            load_backgrounds(folder)
+        for name in ("a.txt", "b.txt", "c.zip", "d"):
+            (folder / name).touch()
+        with pytest.raises(ValueError, match=r"no videos in .*2 x \.txt, 1 x .*; put video files \(.*\.mp4"):
             load_backgrounds(folder)
 
 

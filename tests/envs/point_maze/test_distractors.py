@@ -1,4 +1,4 @@
-"""DistractorPointMaze: PointMaze in front of a moving picture, foreground untouched."""
+"""DistractorPointMaze: PointMaze over a moving background, foreground untouched."""
 
 import gymnasium as gym
 import numpy as np
@@ -35,45 +35,47 @@ def make(**kwargs):
 
 
 @pytest.mark.parametrize("split", ["train", "eval"])
-def test_foreground_is_byte_equal_to_the_clean_picture_and_the_rest_to_the_clip(split):
+def test_foreground_is_byte_equal_to_the_clean_observation_and_the_rest_to_the_clip(split):
     # The clean copies see the same mazes and the same pushes, over several episodes.
     clean, shown = make(split="clean"), make(split=split, color_jitter=False)
     frames = [clip.load() for clip in load_backgrounds(split=split).clips]
     clean.reset(seed=7), shown.reset(seed=7)
     for actions in PUSHES:
-        plain, picture = clean.step(actions)[0], shown.step(actions)[0]
+        plain, observation = clean.step(actions)[0], shown.step(actions)[0]
         masks = foreground(clean)
         factors = shown.factors()
-        behind = np.stack([frames[c][f] for c, f in zip(factors["clip"], factors["frame"], strict=True)])
+        backgrounds = np.stack([frames[c][f] for c, f in zip(factors["clip"], factors["frame"], strict=True)])
         assert 0.15 < masks.mean() < 0.8
-        assert np.array_equal(picture, np.where(masks[:, None], plain, behind))
+        assert np.array_equal(observation, np.where(masks[:, None], plain, backgrounds))
         floor = np.array([226, 226, 220])[:, None, None]
         assert (plain == floor).all(axis=1)[~masks].all()  # nothing of the foreground outside of the mask
 
 
-def test_training_shows_each_episode_in_a_look_of_its_own():
+def test_each_train_episode_has_another_color_jitter():
     clean, shown = make(split="clean"), make()
     frames = [clip.load() for clip in load_backgrounds().clips]
     clean.reset(seed=7), shown.reset(seed=7)
     seen = set()
     for step, actions in enumerate(PUSHES):
-        plain, picture = clean.step(actions)[0], shown.step(actions)[0]
-        factors, looks = shown.factors(), shown._player._color_jitter
-        behind = np.stack([frames[c][f] for c, f in zip(factors["clip"], factors["frame"], strict=True)])
-        floor = looks.apply(behind, np.arange(3))
-        assert np.array_equal(picture, np.where(foreground(clean)[:, None], plain, floor))
-        assert not np.array_equal(floor, behind)
+        plain, observation = clean.step(actions)[0], shown.step(actions)[0]
+        factors, jitter = shown.factors(), shown._player._color_jitter
+        backgrounds = np.stack([frames[c][f] for c, f in zip(factors["clip"], factors["frame"], strict=True)])
+        floor = jitter.apply(backgrounds, np.arange(3))
+        assert np.array_equal(observation, np.where(foreground(clean)[:, None], plain, floor))
+        assert not np.array_equal(floor, backgrounds)
         if step == 3:
-            first = looks._channels.tobytes() + looks._first.tobytes() + looks._flips.tobytes()
+            first = jitter._channels.tobytes() + jitter._first.tobytes() + jitter._flips.tobytes()
         if 3 <= step < 14:  # within the first episode
-            assert looks._channels.tobytes() + looks._first.tobytes() + looks._flips.tobytes() == first
-        seen |= {row.tobytes() for row in np.concatenate([looks._channels, looks._flips, looks._first[..., 0, 0]], 1)}
+            assert jitter._channels.tobytes() + jitter._first.tobytes() + jitter._flips.tobytes() == first
+        seen |= {
+            row.tobytes() for row in np.concatenate([jitter._channels, jitter._flips, jitter._first[..., 0, 0]], 1)
+        }
     assert len(seen) >= 6
     assert len({env.content_hash for env in (shown, make(color_jitter=False), make(split="eval"), clean)}) == 4
     assert make(split="eval").content_hash == make(split="eval", color_jitter=False).content_hash
 
 
-def test_clean_has_the_pictures_of_point_maze_in_the_first_episode():
+def test_clean_has_the_observations_of_point_maze_in_the_first_episode():
     plain = PointMazeVectorEnv(num_envs=3, max_episode_steps=15)
     assert np.array_equal(make(split="clean").reset(seed=3)[0], plain.reset(seed=3)[0])
     factors = make(split="clean")
@@ -127,8 +129,8 @@ def test_a_single_environment_is_a_batch_of_one(order):
 
 def test_shuffled_frames_are_less_alike():
     def similarity(order):
-        pictures, _ = rollout(make(order=order, clips=["fig"], color_jitter=False), steps=14)
-        return np.abs(np.diff(pictures.astype(int), axis=0)).mean()
+        observations, _ = rollout(make(order=order, clips=["fig"], color_jitter=False), steps=14)
+        return np.abs(np.diff(observations.astype(int), axis=0)).mean()
 
     assert similarity("shuffled") > 3 * similarity("video")
 
@@ -146,11 +148,11 @@ def test_final_factors_are_those_of_the_ended_episode():
 def test_render_shows_the_background_enlarged_and_the_agent():
     env = gym.make("DistractorPointMaze-v0", render_mode="rgb_array")
     observation, _ = env.reset(seed=1)
-    picture = env.render()
-    assert picture.shape == (512, 512, 3) and picture.dtype == np.uint8
-    same = (picture[4::8, 4::8].transpose(2, 0, 1) == observation).all(axis=0)
+    image = env.render()
+    assert image.shape == (512, 512, 3) and image.dtype == np.uint8
+    same = (image[4::8, 4::8].transpose(2, 0, 1) == observation).all(axis=0)
     assert same.mean() > 0.99
-    assert (picture == (220, 40, 40)).all(axis=2).sum() > 200
+    assert (image == (220, 40, 40)).all(axis=2).sum() > 200
 
 
 @pytest.mark.parametrize("env_id", ["DistractorPointMaze-v0", "ContinuousDistractorPointMaze-v0"])

@@ -1,4 +1,4 @@
-"""PointMaze: physics against gymnasium-robotics' point body, determinism, copies, rewards, pictures."""
+"""PointMaze: physics against gymnasium-robotics' point body, determinism, copies, rewards, observations."""
 
 import copy
 import importlib.util
@@ -207,17 +207,17 @@ def test_a_batch_equals_single_environments_bit_for_bit(kwargs: dict[str, object
     together = PointMazeVectorEnv(num_envs=n, autoreset=False, **kwargs)  # type: ignore[arg-type]
     alone = [PointMazeEnv(**kwargs) for _ in range(n)]
     generator = np.random.default_rng(5)
-    pictures, _ = together.reset(seed=10)
+    observations, _ = together.reset(seed=10)
     for i, env in enumerate(alone):
-        np.testing.assert_array_equal(env.reset(seed=10 + i)[0], pictures[i])
+        np.testing.assert_array_equal(env.reset(seed=10 + i)[0], observations[i])
     for _ in range(25):
         actions = random_actions(together, generator)
         if together._needs_reset:
             break
-        pictures, rewards, reached, _, _ = together.step(actions)
+        observations, rewards, reached, _, _ = together.step(actions)
         for i, env in enumerate(alone):
-            picture, reward, terminated, _, _ = env.step(actions[i])
-            np.testing.assert_array_equal(picture, pictures[i])
+            observation, reward, terminated, _, _ = env.step(actions[i])
+            np.testing.assert_array_equal(observation, observations[i])
             assert (reward, terminated) == (rewards[i], reached[i])
             for name, value in env.factors().items():
                 np.testing.assert_array_equal(value, together.factors()[name][i])
@@ -227,10 +227,10 @@ def test_reset_with_a_seed_determines_everything() -> None:
     def play(seed: int) -> list[bytes]:
         env = PointMazeVectorEnv(num_envs=3, max_episode_steps=5)
         env.reset(seed=99)
-        frames = [env.reset(seed=seed)[0]]
+        observations = [env.reset(seed=seed)[0]]
         generator = np.random.default_rng(0)
-        frames += [env.step(random_actions(env, generator))[0] for _ in range(12)]
-        return [frame.tobytes() for frame in frames]
+        observations += [env.step(random_actions(env, generator))[0] for _ in range(12)]
+        return [observation.tobytes() for observation in observations]
 
     assert play(1) == play(1)
     assert play(1)[0] != play(2)[0]
@@ -250,8 +250,8 @@ def test_a_copy_goes_on_bit_for_bit(
     assert twin._physics.nthread == 2
     for _ in range(30):
         actions = random_actions(env, generator)
-        (pictures, rewards, *_), (others, other_rewards, *_) = env.step(actions), twin.step(actions)
-        np.testing.assert_array_equal(pictures, others)
+        (observations, rewards, *_), (others, other_rewards, *_) = env.step(actions), twin.step(actions)
+        np.testing.assert_array_equal(observations, others)
         np.testing.assert_array_equal(rewards, other_rewards)
         np.testing.assert_array_equal(env._position, twin._position)
     # Two of each, not one.
@@ -259,7 +259,7 @@ def test_a_copy_goes_on_bit_for_bit(
     assert not np.array_equal(env._position, twin._position)
 
 
-# Rewards, episode ends and pictures.
+# Rewards, episode ends and observations.
 
 
 @pytest.mark.parametrize(("reward_type", "expected"), [("step", [-1.0, 0.0]), ("sparse", [0.0, 1.0])])
@@ -281,11 +281,11 @@ def test_success_is_within_one_meter(end: tuple[float, float], expected: bool) -
     assert env.step(np.array([LEFT]))[2][0] == expected
 
 
-def test_the_picture_shows_what_the_factors_say() -> None:
+def test_the_observation_shows_what_the_factors_are() -> None:
     env = batch(20)
-    pictures = env._observe(np.arange(20))
+    observations = env._observe(np.arange(20))
     factors = env.factors()
-    for picture, (x, y), obstacles in zip(pictures, factors["agent"], factors["obstacles"], strict=True):
+    for observation, (x, y), obstacles in zip(observations, factors["agent"], factors["obstacles"], strict=True):
         solid = solid_pixels(obstacles)
         walls = solid_pixels(np.zeros((0, 2)))
         expected = np.empty((64, 64, 3), dtype=np.uint8)
@@ -296,8 +296,8 @@ def test_the_picture_shows_what_the_factors_say() -> None:
         column, row = (x + 8) * 4, (y + 8) * 4
         distance = np.hypot(np.arange(64) + 0.5 - column, (np.arange(64) + 0.5 - row)[:, None])
         away = distance > 1.2 + 0.75
-        np.testing.assert_array_equal(picture.transpose(1, 2, 0)[away], expected[away])
-        assert (picture[:, int(row), int(column)] == top_down.AGENT).sum() >= 2 or distance.min() > 0.4
+        np.testing.assert_array_equal(observation.transpose(1, 2, 0)[away], expected[away])
+        assert (observation[:, int(row), int(column)] == top_down.AGENT).sum() >= 2 or distance.min() > 0.4
 
 
 def test_observe_over_replaces_the_floor_and_nothing_else() -> None:
@@ -308,9 +308,11 @@ def test_observe_over_replaces_the_floor_and_nothing_else() -> None:
     white = env._observe_over(np.full_like(plain, 255), indices)
     floor = (plain == np.array(top_down.FLOOR, dtype=np.uint8)[:, None, None]).all(axis=1)
     replaced = (black != white).any(axis=1)
-    for picture, value in ((black, 0), (white, 255)):
-        np.testing.assert_array_equal(picture.transpose(0, 2, 3, 1)[~replaced], plain.transpose(0, 2, 3, 1)[~replaced])
-        assert (picture.transpose(0, 2, 3, 1)[replaced] == value).all()
+    for observation, value in ((black, 0), (white, 255)):
+        np.testing.assert_array_equal(
+            observation.transpose(0, 2, 3, 1)[~replaced], plain.transpose(0, 2, 3, 1)[~replaced]
+        )
+        assert (observation.transpose(0, 2, 3, 1)[replaced] == value).all()
     assert not (replaced & ~floor).any()
     # A pixel of which the agent covers less than half a percent may keep the color of the floor.
     assert (floor & ~replaced).sum() <= 2
@@ -318,11 +320,11 @@ def test_observe_over_replaces_the_floor_and_nothing_else() -> None:
 
 def test_render_shows_the_same_scene_enlarged() -> None:
     env = gym.make("PointMaze-v0", render_mode="rgb_array")
-    picture, _ = env.reset(seed=1)
+    observation, _ = env.reset(seed=1)
     frame = env.render()
     assert frame.shape == (512, 512, 3) and frame.dtype == np.uint8
     shrunk = frame.reshape(64, 8, 64, 8, 3).mean(axis=(1, 3)).transpose(2, 0, 1)
-    assert np.abs(shrunk - picture).max() <= 3
+    assert np.abs(shrunk - observation).max() <= 3
     env.close()
 
 

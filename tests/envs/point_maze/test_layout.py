@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from point_maze_inputs import solid_pixels
 
+from sb3_abisim.common.grids import flood_fill, pack
 from sb3_abisim.envs.point_maze import layout as point_maze_layout
 from sb3_abisim.envs.point_maze.env import PointMazeVectorEnv
 
@@ -49,17 +50,17 @@ def test_blocked_layouts_are_rejected_by_the_flood_fill() -> None:
         ring = np.zeros((64, 64), dtype=bool)
         ring[20:44, 20:44], ring[24:40, 24:40] = True, False
         ring[20:24, 30 : 30 + gap] = False
-        board |= int.from_bytes(np.packbits(ring, bitorder="little").tobytes(), "little")
+        board |= pack(ring)
         free = point_maze_layout._FULL & ~board
         blocks = free & free >> 1 & free >> 64 & free >> 65
         start = 1 << (5 * 64 + 5)
-        assert point_maze_layout._connected(blocks, start, point_maze_layout._GOAL_BLOCK) is expected
+        assert bool(flood_fill(point_maze_layout._GOAL_BLOCK, blocks, 64, stop=start) & start) == expected
         assert reachable(ring | solid_pixels(np.zeros((0, 2))))[5, 5] == expected
 
 
 @pytest.mark.parametrize("seed", [217, 408, 419, 469])
-def test_blocked_layouts_are_drawn_again(seed: int) -> None:
+def test_blocked_layouts_are_sampled_again(seed: int) -> None:
     """One in a hundred is; the first of each of these seeds."""
-    _, solid, start = point_maze_layout.draw_layout(np.random.default_rng(seed))
+    _, solid, start = point_maze_layout.sample_layout(np.random.default_rng(seed))
     column, row = point_maze_layout.to_pixels(start)
     assert reachable(solid)[round(row) - 1, round(column) - 1]

@@ -1,4 +1,4 @@
-"""PointMazePixels around gymnasium-robotics' own ids."""
+"""PointMazePixels around the ids of gymnasium-robotics."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -55,14 +55,14 @@ def cell_of(row: int, column: int) -> tuple[slice, slice]:
     return slice(top, top + CELL), slice(left, left + CELL)
 
 
-def color_share(picture: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
-    return (np.abs(picture.astype(int) - np.array(color)[:, None, None]).max(axis=0) == 0).astype(float)
+def color_share(observation: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+    return (np.abs(observation.astype(int) - np.array(color)[:, None, None]).max(axis=0) == 0).astype(float)
 
 
-def test_the_picture_shows_the_map_the_goal_and_the_agent(make: Make) -> None:
+def test_the_observation_shows_the_map_the_goal_and_the_agent(make: Make) -> None:
     env = on_map(make)
-    picture, _ = env.reset(seed=0)
-    walls = color_share(picture, top_down.WALL)
+    observation, _ = env.reset(seed=0)
+    walls = color_share(observation, top_down.WALL)
     for row, line in enumerate(MAP):
         for column, value in enumerate(line):
             if value == 1:
@@ -74,18 +74,18 @@ def test_the_picture_shows_the_map_the_goal_and_the_agent(make: Make) -> None:
     assert walls[:TOP_EDGE].all() and walls[TOP_EDGE + 5 * CELL :].all() and walls[:, 63].all()
     # Noise moves agent and goal by up to a quarter of a cell.
     for color, (row, column) in ((top_down.AGENT, (1, 1)), (top_down.GOAL, (2, 5))):
-        rows, columns = np.nonzero(color_share(picture, color))
+        rows, columns = np.nonzero(color_share(observation, color))
         assert abs(rows.mean() + 0.5 - (TOP_EDGE + (row + 0.5) * CELL)) <= CELL / 4 + 0.5
         assert abs(columns.mean() + 0.5 - (LEFT_EDGE + (column + 0.5) * CELL)) <= CELL / 4 + 0.5
 
 
-def test_agent_and_goal_are_drawn_where_the_simulator_has_them(make: Make) -> None:
+def test_agent_and_goal_are_rendered_where_the_simulator_has_them(make: Make) -> None:
     env = on_map(make)
     for seed in range(4):
-        picture, _ = env.reset(seed=seed)
+        observation, _ = env.reset(seed=seed)
         for name, color in (("agent", top_down.AGENT), ("goal", top_down.GOAL)):
             x, y = env.factors()[name]
-            rows, columns = np.nonzero(color_share(picture, color))
+            rows, columns = np.nonzero(color_share(observation, color))
             # The map is 7 m x 5 m; its middle is the origin.
             assert abs(columns.mean() + 0.5 - (LEFT_EDGE + (x + 3.5) * CELL)) < 0.5
             assert abs(rows.mean() + 0.5 - (TOP_EDGE + (y + 2.5) * CELL)) < 0.5
@@ -94,7 +94,7 @@ def test_agent_and_goal_are_drawn_where_the_simulator_has_them(make: Make) -> No
 
 @pytest.mark.parametrize("continuous", [True, False])
 @pytest.mark.parametrize(("action", "direction"), [(UP, (0, -1)), (DOWN, (0, 1)), (LEFT, (-1, 0)), (RIGHT, (1, 0))])
-def test_pushes_move_the_agent_as_seen_in_the_picture(
+def test_pushes_move_the_agent_as_seen_in_the_observation(
     make: Make, continuous: bool, action: int, direction: tuple[int, int]
 ) -> None:
     env = on_map(make, continuous=continuous, frame_skip=10, momentum=False)
@@ -156,11 +156,11 @@ def test_backgrounds_fill_the_floor_and_nothing_else(make: Make) -> None:
 
 def test_render_needs_no_gl_and_shows_the_scene(make: Make) -> None:
     env = on_map(make)
-    picture, _ = env.reset(seed=0)
+    observation, _ = env.reset(seed=0)
     frame = env.render()
     assert frame.shape == (512, 512, 3) and frame.dtype == np.uint8 and env.render_mode == "rgb_array"
     shrunk = frame.reshape(64, 8, 64, 8, 3).mean(axis=(1, 3)).transpose(2, 0, 1)
-    assert np.abs(shrunk - picture).max() <= 3
+    assert np.abs(shrunk - observation).max() <= 3
 
 
 @pytest.mark.parametrize("env_id", ["PointMaze_UMaze-v3", "PointMaze_Large-v3", "PointMaze_Open_Diverse_GR-v3"])
@@ -168,8 +168,8 @@ def test_render_needs_no_gl_and_shows_the_scene(make: Make) -> None:
 def test_check_env(make: Make, env_id: str, continuous: bool) -> None:
     env = PointMazePixels(make(env_id), continuous=continuous)
     check_env(env)
-    picture, _ = env.reset(seed=0)
-    assert (color_share(picture, top_down.AGENT)).any()
+    observation, _ = env.reset(seed=0)
+    assert (color_share(observation, top_down.AGENT)).any()
 
 
 def test_bad_use_is_refused(make: Make) -> None:

@@ -1,4 +1,4 @@
-"""The rasterizer against brute force, and against MuJoCo's own renderer where GL is present.
+"""The rasterizer against brute force, and against MuJoCo's renderer where GL is present.
 
 The GL comparison needs EGL or OSMesa: ``apt-get install libegl1 libgl1`` or ``apt-get install libosmesa6 libgl1``.
 Without either it is skipped.
@@ -40,13 +40,13 @@ def test_coverage_is_the_area_of_the_disc_in_each_pixel(radius: float, center: t
     np.testing.assert_allclose(top_down.disc_coverage(np.array(center), radius, SIZE), expected, atol=2e-3)
 
 
-def test_the_drawn_disc_lies_where_it_should() -> None:
+def test_the_rendered_disc_lies_where_it_should() -> None:
     generator = np.random.default_rng(0)
     centers = generator.uniform(3, SIZE - 3, (300, 2))
-    pictures = floors(300)
-    DiscPainter(RADIUS, SIZE, top_down.AGENT).draw(pictures, centers)
+    observations = floors(300)
+    DiscPainter(RADIUS, SIZE, top_down.AGENT).render(observations, centers)
     # Green falls from floor to agent in proportion to the coverage.
-    share = (top_down.FLOOR[1] - pictures[:, 1].astype(float)) / (top_down.FLOOR[1] - top_down.AGENT[1])
+    share = (top_down.FLOOR[1] - observations[:, 1].astype(float)) / (top_down.FLOOR[1] - top_down.AGENT[1])
     np.testing.assert_allclose(share.sum(axis=(1, 2)), np.pi * RADIUS**2, atol=0.04)
     middle = np.arange(SIZE) + 0.5
     columns = (share.sum(axis=1) * middle).sum(axis=1) / share.sum(axis=(1, 2))
@@ -57,76 +57,76 @@ def test_the_drawn_disc_lies_where_it_should() -> None:
 def test_neighboring_positions_differ_by_few_gray_levels() -> None:
     painter = DiscPainter(RADIUS, SIZE)
     x = 5 + np.arange(2 * top_down.SUBPIXELS) / top_down.SUBPIXELS
-    pictures = floors(len(x))
-    painter.draw(pictures, np.stack([x, np.full_like(x, 7.3)], axis=1))
-    steps = np.abs(np.diff(pictures.astype(int), axis=0)).reshape(len(x) - 1, -1).max(axis=1)
+    observations = floors(len(x))
+    painter.render(observations, np.stack([x, np.full_like(x, 7.3)], axis=1))
+    steps = np.abs(np.diff(observations.astype(int), axis=0)).reshape(len(x) - 1, -1).max(axis=1)
     assert steps.max() <= 2
     assert steps.min() >= 1
 
 
-def test_a_batch_equals_its_pictures_drawn_alone() -> None:
+def test_a_batch_equals_its_observations_rendered_alone() -> None:
     generator = np.random.default_rng(1)
     centers = generator.uniform(2, SIZE - 2, (5, 2))
     backgrounds = generator.integers(256, size=(5, 3, SIZE, SIZE), dtype=np.uint8)
     painter = DiscPainter(RADIUS, SIZE)
     together = backgrounds.copy()
-    painter.draw(together, centers)
+    painter.render(together, centers)
     for i in range(5):
         alone = backgrounds[i : i + 1].copy()
-        painter.draw(alone, centers[i : i + 1])
+        painter.render(alone, centers[i : i + 1])
         np.testing.assert_array_equal(together[i], alone[0])
         far = np.hypot(*np.meshgrid(np.arange(SIZE) - centers[i, 0], np.arange(SIZE) - centers[i, 1])) > RADIUS + 2
         np.testing.assert_array_equal(together[i][:, far], backgrounds[i][:, far])
 
 
-def test_drawing_over_another_picture_mixes_with_that_one() -> None:
+def test_rendering_over_another_observation_mixes_with_that_one() -> None:
     generator = np.random.default_rng(4)
-    pictures, over = generator.integers(256, size=(2, 6, 3, SIZE, SIZE), dtype=np.uint8)
+    observations, over = generator.integers(256, size=(2, 6, 3, SIZE, SIZE), dtype=np.uint8)
     centers = generator.uniform(2, SIZE - 2, (6, 2))
     painter = DiscPainter(RADIUS, SIZE)
     alone, touched = over.copy(), np.zeros((6, SIZE, SIZE), dtype=bool)
-    painter.draw(alone, centers)
+    painter.render(alone, centers)
     painter.mark(touched, centers)
-    expected = np.where(touched[:, None], alone, pictures)
-    painter.draw(pictures, centers, over=over)
-    np.testing.assert_array_equal(pictures, expected)
+    expected = np.where(touched[:, None], alone, observations)
+    painter.render(observations, centers, over=over)
+    np.testing.assert_array_equal(observations, expected)
 
 
-def test_mark_is_the_set_of_pixels_that_draw_mixes() -> None:
+def test_mark_is_the_set_of_pixels_that_render_mixes() -> None:
     centers = np.random.default_rng(2).uniform(2, SIZE - 2, (50, 2))
     painter = DiscPainter(RADIUS, SIZE, (255, 255, 255))
-    pictures, masks = np.zeros((50, 3, SIZE, SIZE), dtype=np.uint8), np.zeros((50, SIZE, SIZE), dtype=bool)
-    painter.draw(pictures, centers)
+    observations, masks = np.zeros((50, 3, SIZE, SIZE), dtype=np.uint8), np.zeros((50, SIZE, SIZE), dtype=bool)
+    painter.render(observations, centers)
     masks[:, 0, 0] = True
     painter.mark(masks, centers)
-    expected = pictures[:, 0] > 0
+    expected = observations[:, 0] > 0
     expected[:, 0, 0] = True
     np.testing.assert_array_equal(masks, expected)
 
 
 @pytest.mark.parametrize("center", [(1.0, 8.0), (8.0, 1.1), (15.1, 8.0), (8.0, 15.0), (-40.0, 8.0)])
-def test_a_disc_that_leaves_the_picture_is_refused(center: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match=r"leaves the 16 x 16 picture"):
-        DiscPainter(RADIUS, SIZE).draw(floors(1), np.array([center]))
+def test_a_disc_that_leaves_the_observation_is_refused(center: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match=r"leaves the 16 x 16 observation"):
+        DiscPainter(RADIUS, SIZE).render(floors(1), np.array([center]))
 
 
 def test_a_disc_may_come_close_to_the_edges() -> None:
-    pictures = floors(2)
+    observations = floors(2)
     close = SIZE - RADIUS - 1.01
-    DiscPainter(RADIUS, SIZE).draw(pictures, np.array([(RADIUS, 8.5), (close, close)]))
-    assert (pictures[0, :, 8, 1] == top_down.AGENT).all()
-    assert (pictures[1, :, -3, -3] == top_down.AGENT).all()
+    DiscPainter(RADIUS, SIZE).render(observations, np.array([(RADIUS, 8.5), (close, close)]))
+    assert (observations[0, :, 8, 1] == top_down.AGENT).all()
+    assert (observations[1, :, -3, -3] == top_down.AGENT).all()
 
 
-def test_enlarged_picture_shrinks_back_to_the_drawn_one() -> None:
+def test_enlarged_observation_shrinks_back_to_the_rendered_one() -> None:
     backdrop = np.random.default_rng(3).integers(256, size=(3, SIZE, SIZE), dtype=np.uint8)
     center = np.array([6.3, 9.9])
     large = top_down.enlarge(backdrop, center, RADIUS, scale=8)
     assert large.shape == (SIZE * 8, SIZE * 8, 3) and large.dtype == np.uint8
-    drawn = backdrop[None].copy()
-    DiscPainter(RADIUS, SIZE).draw(drawn, center[None])
+    rendered = backdrop[None].copy()
+    DiscPainter(RADIUS, SIZE).render(rendered, center[None])
     shrunk = large.reshape(SIZE, 8, SIZE, 8, 3).mean(axis=(1, 3)).transpose(2, 0, 1)
-    assert np.abs(shrunk - drawn[0]).max() <= 3
+    assert np.abs(shrunk - rendered[0]).max() <= 3
 
 
 def _scene(obstacles: np.ndarray, agent: np.ndarray) -> str:
@@ -167,27 +167,27 @@ def _render_by_mujoco(xml: str, folder: Path) -> np.ndarray:
     (folder / "scene.xml").write_text(xml)
     reasons = []
     for backend in ("egl", "osmesa"):
-        # MuJoCo chooses its backend when it is imported, hence the process of its own.
+        # MuJoCo chooses its backend when it is imported, hence another process.
         done = subprocess.run(
-            [sys.executable, "-c", _RENDER, "scene.xml", "picture.npy"],
+            [sys.executable, "-c", _RENDER, "scene.xml", "seen.npy"],
             cwd=folder,
             env={**os.environ, "MUJOCO_GL": backend},
             capture_output=True,
             text=True,
         )
-        if (folder / "picture.npy").exists():
-            return np.load(folder / "picture.npy")
+        if (folder / "seen.npy").exists():
+            return np.load(folder / "seen.npy")
         reasons.append(f"{backend}: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
     pytest.skip(f"no GL (apt-get install libegl1 libosmesa6 libgl1): {'; '.join(reasons)}")
 
 
 @pytest.mark.parametrize("seed", [0, 5])
-def test_pictures_equal_mujocos_own_orthographic_render(seed: int, tmp_path: Path) -> None:
+def test_observations_equal_mujocos_orthographic_render(seed: int, tmp_path: Path) -> None:
     env = point_maze.PointMazeEnv()
-    picture, _ = env.reset(seed=seed)
+    observation, _ = env.reset(seed=seed)
     factors = env.factors()
     theirs = _render_by_mujoco(_scene(factors["obstacles"], factors["agent"]), tmp_path).astype(int)
-    ours = picture.transpose(1, 2, 0).astype(int)
+    ours = observation.transpose(1, 2, 0).astype(int)
     error = np.abs(ours - theirs).max(axis=-1)
     column, row = point_maze_layout.to_pixels(factors["agent"])
     middles = np.arange(64) + 0.5

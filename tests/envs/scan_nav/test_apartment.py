@@ -1,4 +1,4 @@
-"""The embedded flats: rooms that can be reached, furniture, textures."""
+"""The built-in apartments: rooms that can be reached, furniture, textures."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from sb3_abisim.envs.scan_nav.map import ScanMap
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_flat_looks_like_one(seed):
+def test_an_apartment_has_rooms_furniture_and_textures(seed):
     scan = ScanMap.apartment(seed)
     height, scale = scan.height, scan.meters_per_pixel
     area = {
@@ -22,12 +22,12 @@ def test_a_flat_looks_like_one(seed):
     assert len(np.unique(scan.orthophoto.reshape(-1, 3), axis=0)) > 5000, "textures"
 
 
-def test_a_flat_takes_no_axis():
-    with pytest.raises(ValueError, match="a flat stands upright, it takes no up; got 'y'"):
+def test_an_apartment_takes_no_axis():
+    with pytest.raises(ValueError, match="an apartment stands upright, it takes no up; got 'y'"):
         ScanMap.apartment(0, up="y")
 
 
-def test_seeds_determine_flats():
+def test_seeds_determine_apartments():
     one, again, other = (apartment_mesh(seed) for seed in (0, 0, 1))
     assert np.array_equal(one.vertices, again.vertices) and one.vertices.shape != other.vertices.shape
     assert all(np.array_equal(a.texture, b.texture) for a, b in zip(one.surfaces, again.surfaces, strict=True))
@@ -35,5 +35,5 @@ def test_seeds_determine_flats():
 
 @pytest.mark.parametrize("seed", [-1, 1.5, True], ids=str)
 def test_refuses_seeds(seed):
-    with pytest.raises(ValueError, match=f"seed of a flat .* got {seed}"):
+    with pytest.raises(ValueError, match=f"seed of an apartment .* got {seed}"):
         apartment_mesh(seed)

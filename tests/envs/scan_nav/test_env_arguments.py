@@ -1,16 +1,11 @@
-"""What ScanNav refuses, and how it says it."""
+"""What ScanNav refuses, and the message."""
 
 import numpy as np
 import pytest
-from scan_inputs import empty_room
+from scan_inputs import empty_room, map_of_a_room  # noqa: F401
 
 from sb3_abisim.envs.scan_nav.env import ScanNavEnv
 from sb3_abisim.envs.scan_nav.files import SceneError
-
-
-@pytest.fixture(scope="module")
-def room():
-    return empty_room()
 
 
 def test_refuses_scenes_without_episodes():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from scan_inputs import checkers, floor, own_cache, write  # noqa: F401
+from scan_inputs import checkers, empty_cache, floor, write  # noqa: F401
 
 from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.map import ScanMap
@@ -92,7 +92,7 @@ def test_takes_extensions_that_change_nothing(tmp_path, edit):
     assert np.array_equal(before.texture, after.texture)
 
 
-def damage_picture(header, rest):
+def damage_image(header, rest):
     view = header["bufferViews"][header["images"][0]["bufferView"]]
     start = 8 + view.get("byteOffset", 0)
     assert rest[start + 1 : start + 4] == b"PNG"
@@ -102,10 +102,10 @@ def damage_picture(header, rest):
 @pytest.mark.parametrize(
     ("edit", "binary"),
     [
-        (lambda header: None, damage_picture),
+        (lambda header: None, damage_image),
         (lambda header: header["images"][0].update(mimeType="image/ktx2"), None),
         (lambda header: header.update(textures=[{"extensions": {"KHR_texture_basisu": {"source": 0}}}]), None),
-        (glossy(), damage_picture),
+        (glossy(), damage_image),
     ],
     ids=["damaged", "ktx2", "basisu", "glossy"],
 )
@@ -123,7 +123,7 @@ def test_refuses_textures_that_pillow_finds_too_large(tmp_path, monkeypatch):
 
 
 def two_parts(second):
-    """Edit a file so that it has a second part, which is like the first but for its own texture and ``second``."""
+    """Edit a file so that it has a second part, which is like the first but for the texture and ``second``."""
 
     def edit(header):
         header["meshes"].append(copy.deepcopy(header["meshes"][0]))
@@ -162,7 +162,7 @@ def test_parts_without_any_color_are_a_warning(tmp_path):
     bare = trimesh.Trimesh(floor().vertices, floor().faces, process=False)
     for name in ("bare.ply", "bare.glb", "bare.obj"):
         path = write(trimesh.Scene([bare]), tmp_path / name)
-        with pytest.warns(UserWarning, match=rf"{name}: 1 of 1 parts have no color and are drawn gray"):
+        with pytest.warns(UserWarning, match=rf"{name}: 1 of 1 parts have no color and are shown gray"):
             (surface,) = load_mesh(path).surfaces
         assert (surface.coordinates == 160).all()
 
@@ -200,7 +200,7 @@ def test_obj_without_its_texture_is_one_warning_and_gray(tmp_path, color):
     assert (surface.coordinates == 160).all()
 
 
-def test_a_lost_texture_is_that_of_its_own_part(tmp_path):
+def test_a_lost_texture_is_that_of_one_part(tmp_path):
     """The other half of the floor keeps its color."""
     path = obj(tmp_path / "floor.obj", "", True, "map_Kd lost.png\nnewmtl red\nKd 1 0 0")
     path.write_text(path.read_text().replace("f 1/1 3/3 4/4", "usemtl red\nf 1/1 3/3 4/4"))
@@ -252,7 +252,7 @@ def test_obj_whose_material_has_no_color_is_a_warning(tmp_path, coordinates, mat
     path = obj(tmp_path / "floor.obj", "", coordinates, material)
     if "other" in material:
         path.write_text(path.read_text().replace("usemtl paint", "usemtl nothing"))
-    with pytest.warns(UserWarning, match=r"floor.obj: 1 of 1 parts have no color and are drawn gray"):
+    with pytest.warns(UserWarning, match=r"floor.obj: 1 of 1 parts have no color and are shown gray"):
         (surface,) = load_mesh(path).surfaces
     assert surface.texture is None and (surface.coordinates == 160).all()
 
@@ -273,7 +273,7 @@ def test_refuses_a_texture_beside_the_scan_that_cannot_be_decoded(tmp_path, suff
 
 def test_ply_with_coordinates_and_no_texture_is_a_warning(tmp_path):
     path = write(trimesh.Scene([floor()]), tmp_path / "floor.ply")
-    with pytest.warns(UserWarning, match=r"floor.ply: 1 of 1 parts have no color and are drawn gray"):
+    with pytest.warns(UserWarning, match=r"floor.ply: 1 of 1 parts have no color and are shown gray"):
         (surface,) = load_mesh(path).surfaces
     assert surface.texture is None and (surface.coordinates == 160).all()
 
@@ -292,7 +292,7 @@ def test_a_part_without_coordinates_needs_no_texture(tmp_path):
     path = edited(
         write(trimesh.Scene([floor()]), tmp_path / "floor.glb"),
         lambda header: header["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"),
-        damage_picture,
+        damage_image,
     )
     (surface,) = load_mesh(path).surfaces
     assert surface.texture is None

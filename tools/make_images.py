@@ -1,4 +1,4 @@
-"""Draw the pictures of the environments in README and docs/scan_nav.md: ``python tools/make_pictures.py``."""
+"""Render the images of the environments in README and docs/scan_nav.md: ``python tools/make_images.py``."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 import sb3_abisim  # noqa: F401  (registers the environments)
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
-# (id, seed, steps of random actions before the picture)
+# (id, seed, steps of random actions before the image)
 SHOTS = (
     ("Nav2D-v0", 1, 0),
     ("Nav2DCorridor-v0", 0, 0),
@@ -22,8 +22,8 @@ WIDTH, GAP, CAPTION = 232, 10, 26
 SCAN_SEEDS = (3, 4, 5, 9)
 
 
-def draw_environments() -> None:
-    """A picture of each environment, side by side."""
+def render_environments() -> None:
+    """An image of each environment, side by side."""
     sheet = Image.new("RGB", (len(SHOTS) * (WIDTH + GAP) - GAP, WIDTH + CAPTION), "white")
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(16)
     for i, (env_id, seed, steps) in enumerate(SHOTS):
@@ -38,14 +38,15 @@ def draw_environments() -> None:
     sheet.save(IMAGES / "environments.png", optimize=True)
 
 
-def draw_scan_frames() -> None:
-    """First frames of a few episodes of ScanNav, colors above depth, two screen pixels for one of theirs."""
+def render_scan_observations() -> None:
+    """First observations of a few episodes of ScanNav, colors above depth, enlarged twice."""
     env = gym.make("ScanNav-v0")
     columns = []
     for seed in SCAN_SEEDS:
-        frame, _ = env.reset(seed=seed)
-        columns.append(np.concatenate([frame[:3].transpose(1, 2, 0), np.repeat(frame[3][..., None], 3, axis=-1)]))
-    side = frame.shape[-1]
+        observation, _ = env.reset(seed=seed)
+        colors, depth = observation[:3].transpose(1, 2, 0), np.repeat(observation[3][..., None], 3, axis=-1)
+        columns.append(np.concatenate([colors, depth]))
+    side = observation.shape[-1]
     sheet = np.full((2 * side + GAP // 2, len(columns) * (side + GAP // 2) - GAP // 2, 3), 255, np.uint8)
     for i, column in enumerate(columns):
         left = i * (side + GAP // 2)
@@ -54,5 +55,5 @@ def draw_scan_frames() -> None:
 
 
 if __name__ == "__main__":
-    draw_environments()
-    draw_scan_frames()
+    render_environments()
+    render_scan_observations()

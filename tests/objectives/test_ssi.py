@@ -1,7 +1,6 @@
 """Eq. 5 against a loop-written derivation, its gradients, and that it learns what it must."""
 
 import math
-import re
 
 import gymnasium as gym
 import pytest
@@ -9,7 +8,7 @@ import torch as th
 from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, make_batch
 
 from sb3_abisim.objectives.base import TensorBatch
-from sb3_abisim.objectives.inverse import ACRO, InverseDynamics, adaptive_beta, inverse_dynamics_loss
+from sb3_abisim.objectives.ssi import InverseDynamics, adaptive_beta, inverse_dynamics_loss
 
 
 def test_loss_equals_loop():
@@ -56,12 +55,13 @@ def test_discrete_prediction_term_is_cross_entropy():
 def test_frames_that_transitions_share_count_for_each_of_them():
     th.manual_seed(0)
     frames, actions = th.rand(5, 1, 1, 4), th.tensor([0, 2, 1, 0])
-    now, later = th.tensor([0, 1, 1, 3]), th.tensor([1, 2, 3, 4])
+    index, next_index = th.tensor([0, 1, 1, 3]), th.tensor([1, 2, 3, 4])
+    obs, next_obs = frames[index], frames[next_index]
     gradients = []
-    for batch in (TensorBatch(frames, actions, now, later), TensorBatch.of(frames[now], actions, frames[later])):
+    for batch in (TensorBatch(frames, actions, index, next_index), TensorBatch.of(obs, actions, next_obs)):
         th.manual_seed(1)
         objective = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.1)
-        assert th.equal(batch.obs, frames[now]) and th.equal(batch.next_obs, frames[later])
+        assert th.equal(batch.obs, obs) and th.equal(batch.next_obs, next_obs)
         loss, _ = objective.loss(batch)
         loss.backward()
         gradients.append([loss.detach(), *(p.grad for p in objective.parameters())])
@@ -70,15 +70,15 @@ def test_frames_that_transitions_share_count_for_each_of_them():
 
 @th.no_grad()
 def test_delta_scale():
-    """A weight of 4: a quarter of the state and four times the change; 1 is the plain input, to the bit."""
+    """A scale of 4: a quarter of the state and four times the change; 1 is the plain input, to the bit."""
     losses = []
-    for weight in (4.0, 1.0, None):
+    for scale in (4.0, 1.0, None):
         th.manual_seed(0)
-        kwargs = {} if weight is None else {"delta_scale": weight}
+        kwargs = {} if scale is None else {"delta_scale": scale}
         objective = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.0, **kwargs)
         batch = make_batch(DISCRETE, 7)
         losses.append(float(objective.loss(batch)[0]))
-        if weight == 4.0:
+        if scale == 4.0:
             psi, psi_next = objective.encoder(batch.obs), objective.encoder(batch.next_obs)
             logits = objective.inverse_model(th.cat([0.25 * psi, 4 * psi_next - 4 * psi], dim=1))
             chosen = logits.log_softmax(dim=1)[th.arange(7), batch.actions]
@@ -165,23 +165,6 @@ def test_refuses_bad_settings(kwargs):
 def test_refuses_other_action_spaces():
     with pytest.raises(ValueError, match="MultiBinary"):
         InverseDynamics(LineEncoder(), gym.spaces.MultiBinary(3))
-
-
-def test_acro_is_the_same_loss_for_several_steps():
-    th.manual_seed(0)
-    acro = ACRO(LineEncoder(), DISCRETE, l1_penalty=0.3)
-    ssi = InverseDynamics(LineEncoder(), DISCRETE, l1_penalty=0.3)
-    ssi.load_state_dict(acro.state_dict())
-    batch = make_batch(DISCRETE)
-    assert float(acro.loss(batch)[0].detach()) == float(ssi.loss(batch)[0].detach())
-    for k in (2, [1, 5], [2, 2]):
-        ACRO.check_k(k)
-        with pytest.raises(ValueError, match=re.escape(f"ssi takes single steps, got k = {k}")):
-            InverseDynamics.check_k(k)
-    InverseDynamics.check_k(1)
-    for k in (1, [1, 1]):
-        with pytest.raises(ValueError, match="which is ssi"):
-            ACRO.check_k(k)
 
 
 @pytest.mark.parametrize(("space", "chance"), [(DISCRETE, 1 / 3), (CONTINUOUS, 0.0)])

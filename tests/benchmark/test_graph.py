@@ -1,13 +1,18 @@
-"""What names a job, and what a changed setting changes."""
+"""The jobs of a plan: what names them, and what a changed setting changes."""
 
 import dataclasses
+import re
 from pathlib import Path
 
+import gymnasium as gym
+import index_env  # noqa: F401  (registers environments)
 import pytest
 from zoo_inputs import write_encoder
 
-from sb3_abisim.benchmark.plan import Job, Plan, build, run_labels
-from sb3_abisim.zoo.methods import DISTRACTOR_IDS
+from sb3_abisim.benchmark import graph
+from sb3_abisim.benchmark.graph import build, run_labels
+from sb3_abisim.benchmark.jobs.job import Job
+from sb3_abisim.benchmark.plan import Plan
 
 PLAN = Plan(methods=("abisim", "ssi", "vanilla"), env_ids=("Nav2D-v0", "DistractorPointMaze-v0"), seeds=(0, 1))
 
@@ -22,7 +27,7 @@ def changed(**changes: object) -> list[str]:
     return sorted(job.title for job in build(dataclasses.replace(PLAN, **changes)) if job.name not in there)
 
 
-def test_every_cell_once_and_after_its_inputs() -> None:
+def test_every_job_once_and_after_its_inputs() -> None:
     jobs = build(PLAN)
     seen: set[str] = set()
     for job in jobs:
@@ -166,7 +171,7 @@ def test_random_agents_of_scan_nav_do_not_stop_at_once() -> None:
 def test_distractors_are_evaluated_on_three_splits() -> None:
     for job in build(PLAN):
         if job.kind == "final":
-            distracted = job.inputs[0].settings["env_id"] in DISTRACTOR_IDS
+            distracted = job.inputs[0].settings["env_id"] == "DistractorPointMaze-v0"
             assert job.settings["splits"] == (["eval", "train", "clean"] if distracted else [])
 
 
@@ -207,3 +212,60 @@ def test_settings_that_nothing_else_would_miss(changes: dict[str, object]) -> No
 def test_mistakes_are_named(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         build(dataclasses.replace(PLAN, **changes))
+
+
+OTHERS = Plan(
+    methods=("abisim", "ssi,frozen", "vanilla"), env_ids=("PlainEnv-v0",), seeds=(0,), packages=("index_env", "mine")
+)
+
+
+def test_any_registered_environment_and_packages_for_every_job() -> None:
+    jobs = build(dataclasses.replace(OTHERS, algo="sac"))
+    kinds = [job.kind for job in jobs]
+    assert {kind: kinds.count(kind) for kind in kinds} == {"data": 1, "encoder": 2, "run": 3, "final": 3}
+    assert all(job.command[-3:] == ("--packages", "index_env", "mine") for job in jobs)
+    runs = {job.method: job for job in jobs if job.kind == "run"}
+    # rl-zoo3 has a million steps in its default for sac.
+    assert all("-n 1000000 " in " ".join(run.command) for run in runs.values())
+    assert runs["ssi,frozen"].settings["hyperparams"]["policy"] == "MlpPolicy"
+    # Modules are no settings: they say where something is registered.
+    assert names(jobs) == names(build(dataclasses.replace(OTHERS, algo="sac", packages=())))
+
+
+def test_ids_with_a_namespace_are_no_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(gym.registry, "mine/Plain-v0", gym.spec("PlainEnv-v0"))
+    jobs = build(dataclasses.replace(OTHERS, env_ids=("mine/Plain-v0",), algo="ppo"))
+    assert {job.output.count("/") for job in jobs if job.kind == "data"} == {1}
+    run = next(job for job in jobs if job.kind == "run")
+    # As rl-zoo3 names the model and the folder.
+    assert run.output_file == "mine-Plain-v0.zip" and re.fullmatch(
+        r"runs/mine-Plain-v0/\S+/ppo/mine-Plain-v0_\d+", run.output
+    )
+    assert run.command[run.command.index("--env") + 1] == "mine/Plain-v0"
+
+
+@pytest.mark.parametrize("algo", ["a2c", "qrdqn", "tqc"])
+def test_algorithms_are_those_of_rl_zoo3(algo: str) -> None:
+    plan = dataclasses.replace(OTHERS, methods=("vanilla",), algo=algo, params=(f"{algo}.gamma:0.9",))
+    (run,) = (job for job in build(plan) if job.kind == "run")
+    assert run.settings["hyperparams"]["gamma"] == "0.9"
+    with pytest.raises(ValueError, match=f"{algo} has no hyperparameter 'gama'"):
+        build(dataclasses.replace(plan, params=("gama:0.9",)))
+    with pytest.raises(ValueError, match=f"--params ppo.gamma:0.9 is for ppo, but here is only {algo}"):
+        build(dataclasses.replace(plan, params=("ppo.gamma:0.9",)))
+
+
+def test_hyperparameters_with_wrappers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As rl-zoo3's are for Atari: data is collected and final models are evaluated without."""
+    entry = {"n_timesteps": 1e7, "policy": "CnnPolicy", "env_wrapper": ["a.Wrapper"], "frame_stack": 4}
+    monkeypatch.setattr(graph, "hyperparameters_entry", lambda algo, env_id: dict(entry))
+    with pytest.raises(
+        ValueError, match="have env_wrapper and frame_stack, and data for pretraining is collected without"
+    ):
+        build(dataclasses.replace(OTHERS, final_episodes=0))
+    vanilla = dataclasses.replace(OTHERS, methods=("vanilla",))
+    with pytest.raises(
+        ValueError, match=r"final evaluation is made without env_wrapper, frame_stack; .*--final-episodes 0"
+    ):
+        build(vanilla)
+    assert len(build(dataclasses.replace(vanilla, final_episodes=0))) == 1

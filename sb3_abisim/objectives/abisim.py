@@ -11,27 +11,27 @@ c                     ``c``                           weight of the recursive st
 tau                   ``tau``                         rate of the moving average
 ====================  ==============================  =====================================================
 
-Pairs of states are drawn among those of a batch, many more of them than states: distances between n embeddings cost
-little beside the n embeddings. Two expectations over actions are offered:
+Pairs of states are sampled among those of a batch, many more pairs than states: distances between n embeddings cost
+little beside the n embeddings. There are two expectations over actions:
 
 * ``expectation="uniform"``: the forward model predicts the next embedding for all discrete actions, or for
   ``n_action_samples`` uniform continuous ones, the same for both states (Eq. 7).
 * ``expectation="behavior"``: pairs are transitions that took the same action, and the target uses the next states
-  that were seen; no forward model stands in the target. For continuous actions a pair's actions differ by at most
+  of the data. No forward model stands in the target. For continuous actions, a pair's actions differ by at most
   ``action_radius`` in the L2 norm. The target is then one sample of the expectation, so its loss must be the squared
   one: the minimizer of the paper's absolute difference would be the median over actions, and an obstacle that
   blocks one of four moves would not count.
 
-Two ways to choose the pairs:
+There are two ways to choose the pairs:
 
 * ``pairs="random"``: uniformly (the paper).
-* ``pairs="nearest"``: half of them are the batch's nearest by base distance, and every error counts relative to its base
-  distance. Random pairs differ in where the agent is, so their distances are nearly sums of two norms, which say little
-  about what else an embedding depends on; pairs with the agent in like places tell the influence of each obstacle. The
-  choice looks at the states alone, so the expectation over actions stays what it is.
+* ``pairs="nearest"``: half of them are the batch's nearest by base distance, and every error counts relative to its
+  base distance. Random pairs differ in where the agent is. Their distances are nearly sums of two norms, which say
+  little about what else an embedding depends on. Pairs with the agent in like places show the influence of each
+  obstacle. The choice looks at the states alone, so the expectation over actions stays what it is.
 
-Departures that the released code makes and that are options here: smooth L1 as loss, resetting the forward model
-at an interval, starting from the base encoder's weights.
+Departures that the released code makes are options here: smooth L1 as loss, a reset of the forward model at an
+interval, and a start from the base encoder's weights.
 """
 
 import copy
@@ -50,11 +50,10 @@ from sb3_abisim.registry import register_method
 
 LOSSES = {"l1": nn.functional.l1_loss, "smooth_l1": nn.functional.smooth_l1_loss, "mse": nn.functional.mse_loss}
 EXPECTATIONS = ("uniform", "behavior")
-WASSERSTEIN = ("means", "gaussian")
 PAIRS = ("random", "nearest")
-# Share of nearest pairs for pairs="nearest", and what is added to base distances, in units of their mean, so that an error
-# counts at most 20 times as much as that of a pair at the mean.
+# Share of nearest pairs for pairs="nearest".
 NEAREST_SHARE = 0.5
+# Added to base distances, in units of their mean: an error counts at most 20 times that of a pair at the mean.
 NEAREST_FLOOR = 0.05
 HIDDEN_DIM = 256
 _LOG_STD_RANGE = (-5.0, 2.0)
@@ -89,26 +88,6 @@ def relative_scale(base_distance: th.Tensor) -> th.Tensor:
     mean = base_distance.mean()
     # All zero (a base that has collapsed) would divide by zero; any factor will do then.
     return mean / (base_distance + NEAREST_FLOOR * mean).clamp_min(th.finfo(mean.dtype).tiny)
-
-
-def w1_gaussian(mean_i: th.Tensor, std_i: th.Tensor, mean_j: th.Tensor, std_j: th.Tensor) -> th.Tensor:
-    """W1 distance under the L1 norm between Gaussians with independent dimensions, exact.
-
-    In one dimension the optimal coupling moves x to mean + std z for the same z, so the distance is the mean of a
-    folded normal, ``E|m + s z|`` with m, s the differences of means and standard deviations. Under the L1 norm the
-    dimensions add up. With equal standard deviations this is the L1 distance of the means.
-
-    :param mean_i: (..., features_dim), as the other three
-    :param std_i: standard deviations, above 0
-    :param mean_j: of the other Gaussian
-    :param std_j: of the other Gaussian
-    :return: distances, summed over the last dimension
-    """
-    m, s = mean_i - mean_j, (std_i - std_j).abs()
-    # A vanishing s would divide by zero; the limit is |m|, which this value reaches in float32.
-    safe = s.clamp_min(1e-6)
-    folded = safe * math.sqrt(2.0 / math.pi) * th.exp(-0.5 * (m / safe) ** 2) + m * th.erf(m / safe / math.sqrt(2.0))
-    return folded.sum(dim=-1)
 
 
 def same_action_pairs(actions: th.Tensor, radius: float) -> th.Tensor:
@@ -157,7 +136,7 @@ class ForwardModel(nn.Module):
         return -log_prob.mean()
 
     def reset(self) -> None:
-        """Draw new weights."""
+        """Sample new weights."""
         self.network.load_state_dict(MLP(*self.dims).state_dict())
 
 
@@ -171,9 +150,8 @@ class ActionBisimulation(Objective):
     :param tau: rate of the target encoder, per update; the smaller, the more updates it takes to look ahead
     :param expectation: "uniform" or "behavior" (module docstring)
     :param distance_loss: "l1" (the paper), "smooth_l1" (the released code) or "mse"
-    :param wasserstein: "means" or "gaussian", which also counts the predicted variance (:func:`w1_gaussian`)
     :param l1_penalty: weight of the mean L1 norm of the embedding in the loss. Distances of most pairs are sums of two
-        norms, and parts of an embedding that see only far obstacles may fluctuate at no cost; a small penalty
+        norms, so parts of an embedding that respond to far obstacles alone may fluctuate at no cost. A small penalty
         silences them
     :param pairs: "random" or "nearest" (module docstring)
     :param n_pairs: pairs of states per update
@@ -194,7 +172,6 @@ class ActionBisimulation(Objective):
         tau: float = 0.01,
         expectation: str = "uniform",
         distance_loss: str = "l1",
-        wasserstein: str = "means",
         l1_penalty: float = 0.0,
         pairs: str = "random",
         n_pairs: int = 4096,
@@ -210,20 +187,17 @@ class ActionBisimulation(Objective):
             raise ValueError(f"l1_penalty must be a number of at least 0, got {l1_penalty}")
         if not 0 < tau <= 1:
             raise ValueError(f"tau must lie in (0, 1], got {tau}")
-        for value, known in (
-            (expectation, EXPECTATIONS),
-            (distance_loss, LOSSES),
-            (wasserstein, WASSERSTEIN),
-            (pairs, PAIRS),
+        for name, value, known in (
+            ("expectation", expectation, EXPECTATIONS),
+            ("distance_loss", distance_loss, LOSSES),
+            ("pairs", pairs, PAIRS),
         ):
             if value not in known:
-                raise ValueError(f"{value!r} is not one of {tuple(known)}")
-        if expectation == "behavior" and wasserstein != "means":
-            raise ValueError("wasserstein='gaussian' needs the forward model of expectation='uniform'")
+                raise ValueError(f"{name} must be one of {tuple(known)}, got {value!r}")
         if forward_reset_interval is not None and forward_reset_interval < 1:
             raise ValueError(f"forward_reset_interval must be at least 1 or None, got {forward_reset_interval}")
         self.c, self.tau, self.l1_penalty = c, tau, l1_penalty
-        self.expectation, self.distance_loss, self.wasserstein = expectation, distance_loss, wasserstein
+        self.expectation, self.distance_loss = expectation, distance_loss
         for name, count in (("n_pairs", n_pairs), ("n_action_samples", n_action_samples)):
             if not isinstance(count, int) or count < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {count}")
@@ -299,16 +273,16 @@ class ActionBisimulation(Objective):
         return i, j
 
     def _expected_w1(self, phi: th.Tensor, i: th.Tensor, j: th.Tensor) -> th.Tensor:
-        """E_a[W1] between the predictions for pairs of a batch, (n_pairs,); both states take the same actions."""
+        """E_a[W_1] between the predictions for pairs of a batch, (n_pairs,); both states take the same actions.
+
+        As in the paper, W_1 is the L1 distance of the means.
+        """
         assert self.forward_model is not None
         actions = self._expectation_actions(phi.device)
         total = th.zeros(len(i), device=phi.device)
         for action in actions:
-            mean, std = self.forward_model(phi, action.expand(len(phi), -1))
-            if self.wasserstein == "means":
-                total += l1_distance(mean[i], mean[j])
-            else:
-                total += w1_gaussian(mean[i], std[i], mean[j], std[j])
+            mean, _ = self.forward_model(phi, action.expand(len(phi), -1))
+            total += l1_distance(mean[i], mean[j])
         return total / len(actions)
 
     def _expectation_actions(self, device: th.device) -> th.Tensor:

@@ -1,4 +1,4 @@
-"""Regularized inverse dynamics (the paper's Eq. 5, L_ss): SSI for k = 1, ACRO for k > 1.
+"""SSI, regularized single-step inverse dynamics (the paper's Eq. 5, L_ss).
 
 ====================  =======================================  ==========================================
 paper                 here                                     meaning
@@ -9,10 +9,10 @@ beta                  ``l1_penalty``                           weight of the L1 
 beta_max, alpha       ``l1_penalty``, ``accuracy``             adaptive regularization (appendix)
 ====================  =======================================  ==========================================
 
-Choices: losses are means over the batch where the paper writes sums over the data set. The paper's table ends the
-inverse model in a layer of 256 (Nav2D) or 32 (Pointmass) units, which is no distribution over actions; ours ends in
+Choices: losses are means over the batch where the paper writes sums over the dataset. The paper's table ends the
+inverse model in a layer of 256 (Nav2D) or 32 (Pointmass) units, which is no distribution over actions. Here it ends in
 one logit per action, or mean and log standard deviation per continuous action dimension. The accuracy alpha of a
-continuous prediction is taken to be its coefficient of determination, clipped to 0..1.
+continuous prediction is its coefficient of determination, clipped to 0..1.
 """
 
 import math
@@ -50,8 +50,8 @@ def inverse_dynamics_loss(
 def adaptive_beta(beta_max: float, accuracy: th.Tensor, form: str, chance: float = 0.0) -> th.Tensor:
     """The regularization for the present accuracy: more of it once actions are predicted well.
 
-    Guessing one of n actions is right in 1 of n cases, for which both other forms already ask for some penalty: an
-    embedding that has found nothing yet can be held at zero by it for good. "chance_corrected" asks for none then.
+    A guess among n actions is right in 1 of n cases, where both other forms already ask for some penalty. The penalty
+    can hold an embedding that has found nothing yet at zero for good. "chance_corrected" asks for none then.
 
     :param beta_max: largest weight
     :param accuracy: of the previous iteration, 0..1
@@ -68,15 +68,15 @@ def adaptive_beta(beta_max: float, accuracy: th.Tensor, form: str, chance: float
 
 
 class InverseDynamics(Objective):
-    """Embed what is needed to tell which action led from s_t to s_{t+k}, and as little else as possible.
+    """Embed what is needed to predict which action led from s_t to s_{t+k}, and as little else as possible.
 
     :param encoder: the network to pretrain
     :param action_space: ``Discrete`` or one-dimensional ``Box``
     :param l1_penalty: beta, or beta_max with ``adaptive``
     :param adaptive: None for a fixed beta, else "paper", "released" or "chance_corrected" (see :func:`adaptive_beta`)
     :param delta_scale: how much more the inverse model's input shows of the change than of the state:
-        (psi(s) / w, w (psi(s') - psi(s))). Where the agent is a small part of a varied picture, a large weight lets the
-        change stand out from the start; 1 is the plain input
+        (psi(s) / w, w (psi(s') - psi(s))). Where the agent is a small part of a varied observation, a large scale lets
+        the change stand out from the start; 1 is the plain input
     """
 
     name = "ssi"
@@ -95,7 +95,7 @@ class InverseDynamics(Objective):
         if adaptive is not None and adaptive not in ADAPTIVE_FORMS:
             raise ValueError(f"adaptive must be None or one of {ADAPTIVE_FORMS}, got {adaptive!r}")
         if not 0 < delta_scale < math.inf:
-            raise ValueError(f"change_weight must be a number above 0, got {delta_scale}")
+            raise ValueError(f"delta_scale must be a number above 0, got {delta_scale}")
         self.l1_penalty = l1_penalty
         self.adaptive = adaptive
         self.delta_scale = delta_scale
@@ -140,24 +140,4 @@ class InverseDynamics(Objective):
         return log_prob, (1.0 - unexplained).clamp(0.0, 1.0).detach()
 
 
-class ACRO(InverseDynamics):
-    """The same for k > 1 (ACRO, Lamb et al.): which action was the first of k steps from s_t to s_{t+k}.
-
-    The number of steps is not given to the inverse model, as in the paper.
-    """
-
-    name = "acro"
-
-    @classmethod
-    def check_k(cls, k: int | list[int]) -> None:
-        """Refuse single steps, which are SSI.
-
-        :param k: steps between the two observations, or the fewest and the most of them
-        :raises ValueError: for k = 1
-        """
-        if k in (1, [1, 1]):
-            raise ValueError("acro needs k > 1, got k = 1, which is ssi")
-
-
 register_method("ssi", InverseDynamics, label="single-step inverse dynamics", extractor="SSIExtractor", color="#009E73")
-register_method("acro", ACRO, label="multi-step inverse dynamics (ACRO)", extractor="ACROExtractor", color="#CC79A7")

@@ -1,0 +1,103 @@
+"""The grammar and the manners that all commands share."""
+
+import argparse
+import errno
+
+import pytest
+
+from sb3_abisim.common.cli import import_packages, make_parser, parse_pairs, parse_value, run
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3", 3),
+        ("1e-4", 1e-4),
+        ("-2.5", -2.5),
+        ("true", True),
+        ("True", True),
+        ("null", None),
+        ("None", None),
+        ("'3'", "3"),
+        ("house.glb", "house.glb"),
+        ("lin_0.001", "lin_0.001"),
+        ("[1, 5]", [1, 5]),
+        ("[1e-4, one]", [1e-4, "one"]),
+        ("(1, 2)", (1, 2)),
+        ("{c: 0.9, pairs: nearest, rate: 1e-3}", {"c": 0.9, "pairs": "nearest", "rate": 1e-3}),
+        ("dict(net_arch=[1])", "dict(net_arch=[1])"),
+        ("__import__('os').getcwd()", "__import__('os').getcwd()"),
+        ("2020-01-01", "2020-01-01"),
+        ("[unclosed", "[unclosed"),
+        ("", None),
+    ],
+)
+def test_values(text: str, value: object) -> None:
+    parsed = parse_value(text)
+    assert parsed == value and type(parsed) is type(value)
+
+
+def test_pairs_keep_what_follows_the_first_colon() -> None:
+    pairs = parse_pairs(["a:1", "objective_kwargs.c:0.9", "path:C:/x", "a:2"], "-params")
+    assert pairs == {"a": 2, "objective_kwargs.c": 0.9, "path": "C:/x"}
+
+
+@pytest.mark.parametrize("word", ["a", "a=1", ":1", "1a:2", "a b:1", "a.:1"])
+def test_a_word_that_is_no_pair_is_named(word: str) -> None:
+    with pytest.raises(ValueError, match="-params takes NAME:VALUE words such as k:5, got"):
+        parse_pairs([word], "-params")
+
+
+def outcome(function: object, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[object, str]:
+    parser = make_parser("some command", "Do something.", "some command -n 3")
+    with pytest.raises(SystemExit) as caught:
+        run(parser, list(words), function, "stopped; go on")  # type: ignore[arg-type]
+    return caught.value.code, capsys.readouterr().err
+
+
+def raising(error: BaseException) -> object:
+    def function(args: argparse.Namespace) -> None:
+        raise error
+
+    return function
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (ValueError("two\n  lines"), 2),
+        (FileNotFoundError("two lines"), 2),
+        (ImportError("two lines"), 2),
+        (OSError(errno.ENOSPC, "two lines"), 1),
+        (FloatingPointError("two lines"), 1),
+    ],
+)
+def test_an_error_is_one_line(error: BaseException, code: int, capsys: pytest.CaptureFixture[str]) -> None:
+    got, text = outcome(raising(error), capsys)
+    assert got == code
+    line = text.strip().splitlines()[-1]
+    assert line.startswith("sb3-abisim some command: ") and "two lines" in line
+    assert "Traceback" not in text
+
+
+def test_an_interrupt_says_how_to_go_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert outcome(raising(KeyboardInterrupt()), capsys) == (130, "sb3-abisim some command: stopped; go on\n")
+
+
+def test_a_bug_keeps_its_traceback() -> None:
+    with pytest.raises(RuntimeError):
+        run(make_parser("x", "X.", "x"), [], raising(RuntimeError("a bug")))  # type: ignore[arg-type]
+
+
+def test_the_example_of_the_help_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    example = "collect --env " + "x" * 120
+    with pytest.raises(SystemExit):
+        make_parser("collect", "Collect.", example).parse_args(["--help"])
+    assert f"example: sb3-abisim {example}" in capsys.readouterr().out.splitlines()
+
+
+def test_packages_are_imported_first_or_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match=r"--packages: cannot import 'no_such_module'.*install it or set PYTHONPATH"):
+        import_packages(["no_such_module"])
+    got, text = outcome(lambda args: pytest.fail("ran"), capsys, "--packages", "no_such_module")
+    assert got == 2 and "no_such_module" in text

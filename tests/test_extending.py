@@ -1,0 +1,130 @@
+"""The package of docs/extending.md, run from outside of ours: by import, and by an entry point."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "extending.md"
+SMALL_PRETRAIN = ["n_updates:30", "log_interval:10", "batch_size:32"]
+SMALL_PPO = ["n_envs:2", "n_steps:32", "batch_size:32", "n_epochs:1"]
+
+
+def modules() -> dict[str, str]:
+    """The page's modules by path."""
+    blocks = re.findall(r"```python\n(# (my_package/\w+\.py)\n.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    return {path: text for text, path in blocks}
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package, as ``PYTHONPATH`` takes it."""
+    folder = tmp_path_factory.mktemp("outside")
+    for path, text in modules().items():
+        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def plugin(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same, and what an installer writes beside it for the page's entry point."""
+    declared = re.search(r'\[project\.entry-points\."([\w.]+)"\]\n(\w+) = "(\w+)"', PAGE.read_text(encoding="utf-8"))
+    assert declared is not None
+    group, name, module = declared.groups()
+    folder = tmp_path_factory.mktemp("installed")
+    (folder / "my_package").symlink_to(package / "my_package")
+    info = folder / "my_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {module}\n")
+    return folder
+
+
+def run(folder: Path, cwd: Path, *words: str, code: int = 0) -> str:
+    path = os.pathsep.join([str(folder), str(ROOT)])
+    env = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_abisim", *words], cwd=cwd, env=env, capture_output=True, text=True
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def test_the_page_has_a_module_for_each_kind() -> None:
+    text = "".join(modules().values())
+    for name in ("register_method(", "register_network(", "register_traits(", "register_reader("):
+        assert name in text
+
+
+@pytest.mark.parametrize("by", ["packages", "entry point"])
+def test_everything_runs_with_what_a_package_adds(package: Path, plugin: Path, tmp_path: Path, by: str) -> None:
+    folder, flag = (package, ["--packages", "my_package"]) if by == "packages" else (plugin, [])
+    env = ["--env", "my/Dot-v0"]
+    run(folder, tmp_path, "collect", *flag, *env, "-n", "2000", "-o", "data")
+    meta = json.loads((tmp_path / "data" / "meta.json").read_bytes())
+    assert (meta["env_id"], list(meta["factors"])) == ("my/Dot-v0", ["position"])
+    words = ["--objective", "self_prediction", "--data", "data", "-o", "dot.safetensors"]
+    run(folder, tmp_path, "pretrain", *flag, *words, "-params", *SMALL_PRETRAIN)
+    card = json.loads((tmp_path / "dot.json").read_bytes())
+    assert "train/prediction_error" in card["curves"] and card["features_dim"] == 32
+    budget = ["-n", "64", "--eval-freq", "-1", "-f", "logs", "-params", *SMALL_PPO]
+    for spec, label in (("self_prediction=dot.safetensors", False), ("self_prediction=dot.safetensors,frozen", True)):
+        output = run(folder, tmp_path, "train", *flag, "--algo", "ppo", *env, "--conf-file", spec, *budget)
+        assert "Encoder" in output or "callback" not in output
+        record = json.loads(max((tmp_path / "logs").glob("ppo/*/*/method.json"), key=os.path.getmtime).read_bytes())
+        assert (record["method"], record["frozen"]) == ("self_prediction", label)
+        assert record["encoder_hash"]
+    run(folder, tmp_path, "analyze", "probes", *flag, *env, "dot.safetensors", "-n", "20", "--images", "figures")
+    probes = json.loads((tmp_path / "figures" / "probes-my-Dot-v0.json").read_bytes())
+    assert "dot.safetensors" in probes["encoders"]
+    small = ["--seeds", "0", "--n-transitions", "1000", "-n", "64", "--eval-freq", "32", "--eval-episodes", "1"]
+    small += ["--n-eval-envs", "1", "--final-episodes", "1", "--device", "cpu", "-params", *SMALL_PPO]
+    small += ["--pretrain-params", *SMALL_PRETRAIN, "--methods", "self_prediction", "vanilla", "-o", "benchmark"]
+    run(folder, tmp_path, "benchmark", *flag, *env, *small)
+    page = (tmp_path / "benchmark" / "report" / "index.html").read_text(encoding="utf-8")
+    assert "self-prediction" in page and "my/Dot-v0" in page
+
+
+def test_a_reader_makes_a_dataset(package: Path, tmp_path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (11, 3, 20, 20), dtype=np.uint8)
+    np.savez(tmp_path / "episode.npz", observations=frames, actions=np.arange(10) % 4)
+    words = ["data", "import", "npz_episode", "episode.npz", "-o", "data"]
+    run(package, tmp_path, *words, "--packages", "my_package.reader")
+    from sb3_abisim import TransitionDataset
+
+    dataset = TransitionDataset(tmp_path / "data", eval_fraction=0.0)
+    assert dataset.n_transitions == 10
+    assert np.array_equal(dataset.frames(np.arange(11)), frames)
+
+
+def test_without_the_package_everything_is_refused_by_name(package: Path, tmp_path: Path) -> None:
+    assert "unknown environment 'my/Dot-v0'" in run(
+        package, tmp_path, "collect", "--env", "my/Dot-v0", "-n", "9", "-o", "d", code=2
+    )
+    run(package, tmp_path, "collect", "--packages", "my_package", "--env", "my/Dot-v0", "-n", "500", "-o", "data")
+    words = ["pretrain", "--objective", "self_prediction", "--data", "data", "-o", "dot.safetensors"]
+    refused = run(package, tmp_path, *words, code=2)
+    assert "unknown method 'self_prediction'" in refused and "--packages" in refused
+    run(package, tmp_path, *words, "--packages", "my_package", "-params", *SMALL_PRETRAIN)
+    refused = run(package, tmp_path, "pretrain", "--objective", "abisim", "--data", "data", "-o", "x.safetensors",
+                  "--base", "dot.safetensors", code=2)  # fmt: skip
+    assert "tiny" in refused and "--packages" in refused
+    assert len(refused.strip().splitlines()[-1]) > 0
+
+
+def test_a_broken_plugin_is_left_out_with_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text("raise RuntimeError('no such luck')\n")
+    info = tmp_path / "broken-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[sb3_abisim.plugins]\nbroken = broken\n")
+    output = run(tmp_path, tmp_path, "collect", "--env", "Nav2D-v0", "-n", "64", "-o", "data")
+    assert "the plugin broken (broken) cannot be loaded" in output and "no such luck" in output
+    assert (tmp_path / "data" / "meta.json").is_file()

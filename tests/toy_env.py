@@ -1,0 +1,49 @@
+"""An environment of another package; imported by tests and, in child processes, by --packages.
+
+Its image observations fit a default network. Nothing of sb3_abisim names it, and it has no batch.
+"""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.registry import EnvTraits, register_traits
+
+SHAPE = (3, 64, 64)
+LENGTH = 6
+
+
+class ToyEnv(gym.Env[NDArray[np.uint8], np.int64]):
+    """Random image observations; the reward depends on observation and action. ``scale`` multiplies it."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, scale: float = 1.0, split: str = "train", render_mode: str | None = None) -> None:
+        self.observation_space = gym.spaces.Box(0, 255, SHAPE, np.uint8)
+        self.action_space = gym.spaces.Discrete(2)
+        self.scale, self.split, self.render_mode = scale, split, render_mode
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._step = 0
+        return self._observe(), {}
+
+    def step(self, action: np.int64) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        self._step += 1
+        observation = self._observe()
+        reward = self.scale * (float(observation[0, 0, 0]) / 255 + float(action))
+        return observation, reward, self._step == LENGTH, False, {"is_success": True}
+
+    def render(self) -> NDArray[np.uint8]:
+        return np.zeros((64, 64, 3), np.uint8)
+
+    def _observe(self) -> NDArray[np.uint8]:
+        return self.np_random.integers(0, 256, SHAPE, np.uint8)
+
+
+gym.register("Toy-v0", entry_point=ToyEnv)
+# The same with what sb3_abisim knows of an environment.
+gym.register("SplitToy-v0", entry_point=ToyEnv)
+register_traits("SplitToy-v0", EnvTraits(splits=("eval", "train"), split_kwargs=("split",)))

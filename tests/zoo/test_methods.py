@@ -1,0 +1,192 @@
+"""Method specs as hyperparameters, and the record that a run keeps of its method."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch as th
+from torch import nn
+from zoo_inputs import write_encoder
+
+from sb3_abisim.rl.extractors import extractor_class
+from sb3_abisim.rl.optimizers import EncoderLRAdam
+from sb3_abisim.zoo.methods import (
+    ENCODER_CALLBACK,
+    ENCODING_WRAPPER,
+    MethodRecord,
+    MethodSpec,
+    encoding_kwargs,
+    resolve_classes,
+)
+
+
+def test_method_specs() -> None:
+    assert MethodSpec.parse("ssi") == MethodSpec("ssi", None, False)
+    assert MethodSpec.parse("abisim,frozen") == MethodSpec("abisim", None, True)
+    assert MethodSpec.parse("abisim=a=b,c.safetensors") == MethodSpec("abisim", "a=b,c.safetensors", False)
+    assert MethodSpec.parse("ssi=hf://o/r/f.safetensors,frozen") == MethodSpec("ssi", "hf://o/r/f.safetensors", True)
+
+
+@pytest.mark.parametrize("text", ["", "acroo", "abisim,freeze", "ssi=", "ssi=,frozen", "vanilla=x", "vanilla,frozen"])
+def test_wrong_method_specs(text: str) -> None:
+    with pytest.raises(ValueError, match=r"give METHOD|takes neither"):
+        MethodSpec.parse(text)
+
+
+def test_other_conf_files_are_no_method_specs() -> None:
+    for config in ("mine.yml", "folder/mine.yaml", "mine.py", "sb3_abisim.zoo", "json"):
+        assert MethodSpec.of_conf_file(config) is None
+    assert MethodSpec.of_conf_file("ssi,frozen") == MethodSpec("ssi", None, True)
+    for config in ("no_such_module", "no_such_module.hyperparams", "./mine", "folder/mine"):
+        with pytest.raises(ValueError, match=f"'{config}' is no YAML or Python file, module or method; a method is"):
+            MethodSpec.of_conf_file(config)
+
+
+ENTRY: dict[str, Any] = {
+    "policy": "CnnPolicy",
+    "gamma": 0.9,
+    "callback": ENCODER_CALLBACK,
+    "policy_kwargs": {
+        "features_extractor_class": "sb3_abisim.ActionBisimExtractor",
+        "features_extractor_kwargs": {"encoder": "Toy-v0/abisim", "freeze": True},
+        "net_arch": [7],
+    },
+}
+
+
+def test_an_entry_of_this_package() -> None:
+    assert MethodSpec("curl").hyperparameters(ENTRY) == {
+        "policy": "CnnPolicy",
+        "policy_kwargs": {
+            "features_extractor_class": "sb3_abisim.CURLExtractor",
+            "features_extractor_kwargs": {"encoder": "Toy-v0/curl"},
+            "net_arch": [7],
+        },
+    }
+    assert MethodSpec("vanilla").hyperparameters(ENTRY)["policy_kwargs"] == {
+        "features_extractor_class": "sb3_abisim.VanillaExtractor",
+        "net_arch": [7],
+    }
+    assert MethodSpec("ssi", None, True).hyperparameters(ENTRY) == {
+        "policy": "MlpPolicy",
+        "policy_kwargs": {"net_arch": [7]},
+        "vec_env_wrapper": [{ENCODING_WRAPPER: {"encoder": "Toy-v0/ssi", "objective": "ssi"}}],
+    }
+
+
+def test_an_entry_of_rl_zoo3() -> None:
+    """The policy becomes one for images, the wrappers stay in front of the encoder, and the run reports its encoder."""
+    entry = {"policy": "MlpLstmPolicy", "vec_env_wrapper": "some.Wrapper", "callback": "some.Callback"}
+    assert MethodSpec("ssi", "f").hyperparameters(entry) == {
+        "policy": "CnnLstmPolicy",
+        "policy_kwargs": {
+            "features_extractor_class": "sb3_abisim.SSIExtractor",
+            "features_extractor_kwargs": {"encoder": "f"},
+        },
+        "callback": ["some.Callback", ENCODER_CALLBACK],
+    }
+    assert MethodSpec("ssi", "f", True).hyperparameters({**entry, "policy": "CnnLstmPolicy"}) == {
+        "policy": "MlpLstmPolicy",
+        "policy_kwargs": {},
+        "vec_env_wrapper": ["some.Wrapper", {ENCODING_WRAPPER: {"encoder": "f", "objective": "ssi"}}],
+        "callback": ["some.Callback", ENCODER_CALLBACK],
+    }
+    for spec in (MethodSpec("ssi"), MethodSpec("ssi", None, True)):
+        with pytest.raises(ValueError, match=r"no encoder ships for this environment; .*--conf-file ssi=FILE"):
+            spec.hyperparameters(entry)
+    for policy in ("LinearPolicy", "MultiInputPolicy"):
+        with pytest.raises(ValueError, match=f"needs a policy for one image observation, and {policy} is none"):
+            MethodSpec("ssi", "f").hyperparameters({"policy": policy})
+    assert MethodSpec("ssi", "f").hyperparameters({"policy": "my.Policy"})["policy"] == "my.Policy"
+
+
+def test_an_entry_with_a_text() -> None:
+    """rl-zoo3 evaluates it, then the method replaces what chooses the extractor."""
+    entry = {"policy": "CnnPolicy", "policy_kwargs": "dict(net_arch=[7])"}
+    assert "policy_kwargs" not in MethodSpec("ssi", "f").hyperparameters(entry)
+    evaluated = {"net_arch": [7], "features_extractor_class": nn.Module, "features_extractor_kwargs": {"width": 3}}
+    assert MethodSpec("vanilla").policy_kwargs(evaluated) == {
+        "net_arch": [7],
+        "features_extractor_class": "sb3_abisim.VanillaExtractor",
+    }
+    assert MethodSpec("ssi", "f", True).policy_kwargs(evaluated) == {"net_arch": [7]}
+
+
+def test_what_the_user_sets_beside_a_method() -> None:
+    text = {"policy": "CnnPolicy", "policy_kwargs": "dict(net_arch=[7])"}
+    for spec, entry, name in (
+        (MethodSpec("ssi"), ENTRY, "policy_kwargs"),
+        (MethodSpec("ssi", "f"), text, "policy_kwargs"),
+        (MethodSpec("ssi", "f", True), text, "policy_kwargs"),
+        (MethodSpec("ssi", None, True), ENTRY, "policy"),
+        (MethodSpec("ssi", None, True), ENTRY, "vec_env_wrapper"),
+    ):
+        with pytest.raises(ValueError, match=f"-params {name} would undo --conf-file ssi; give one of the two"):
+            spec.hyperparameters(entry, [name])
+    # Theirs are kept.
+    assert "policy" not in MethodSpec("ssi").hyperparameters(ENTRY, ["policy", "gamma"])
+    assert "callback" not in MethodSpec("ssi", "f").hyperparameters(text, ["callback"])
+
+
+def test_a_file_with_another_network_names_it(tmp_path: Path) -> None:
+    path = tmp_path / "small.safetensors"
+    write_encoder(path, "Nav2D-v0", "ssi", features_dim=90)
+    kwargs = MethodSpec("ssi", str(path)).policy_kwargs({})
+    assert kwargs["features_extractor_kwargs"] == {
+        "encoder": str(path),
+        "network": "Nav2DEncoder",
+        "network_kwargs": {"n_input_channels": 3, "features_dim": 90},
+    }
+    write_encoder(path, "Nav2D-v0", "ssi")
+    state = th.random.get_rng_state()
+    assert MethodSpec("ssi", str(path)).policy_kwargs({})["features_extractor_kwargs"] == {"encoder": str(path)}
+    # The random numbers of the run do not depend on the look-up.
+    assert th.equal(th.random.get_rng_state(), state)
+
+
+def test_classes_by_dotted_path() -> None:
+    kwargs = {
+        "features_extractor_class": "sb3_abisim.SSIExtractor",
+        "activation_fn": "torch.nn.ReLU",
+        "optimizer_class": "sb3_abisim.EncoderLRAdam",
+        "net_arch": {"pi": [7]},
+    }
+    before = dict(kwargs)
+    assert resolve_classes(kwargs) == {
+        "features_extractor_class": extractor_class("ssi"),
+        "activation_fn": nn.ReLU,
+        "optimizer_class": EncoderLRAdam,
+        "net_arch": {"pi": [7]},
+    }
+    assert kwargs == before
+    assert resolve_classes({"activation_fn": nn.Tanh}) == {"activation_fn": nn.Tanh}
+    assert resolve_classes(None) is None
+    for path in ("ReLU", "nn.ReLU", "torch.nn.RELU", "sb3_abisim.NobodysExtractor", ""):
+        with pytest.raises(ValueError, match=f"cannot import activation_fn '{path}' .*give its dotted path"):
+            resolve_classes({"activation_fn": path})
+
+
+def test_arguments_of_the_encoding_wrapper() -> None:
+    for wrapper in (ENCODING_WRAPPER, "sb3_abisim.rl.vec_encode.VecEncodeObservations"):
+        entry = {wrapper: {"encoder": "e"}}
+        assert encoding_kwargs({"vec_env_wrapper": [{"some.Wrapper": {}}, "other.Wrapper", entry]}) == {"encoder": "e"}
+        assert encoding_kwargs({"vec_env_wrapper": entry}) == {"encoder": "e"}
+    for none in ({}, {"vec_env_wrapper": None}, {"vec_env_wrapper": ["some.Wrapper"]}):
+        assert encoding_kwargs(none) is None
+
+
+def test_records(tmp_path: Path) -> None:
+    assert MethodRecord.read(tmp_path) is None
+    record = MethodRecord("ssi", True, "e", "0" * 64, {"frame_stack": 4, "env_wrapper": [nn.Module]})
+    record.write(tmp_path)
+    document = json.loads((tmp_path / "method.json").read_text())
+    assert document["preprocessing"]["env_wrapper"] == [str(nn.Module)]
+    read = MethodRecord.read(tmp_path)
+    assert read is not None and (read.label, read.encoder_hash) == ("ssi,frozen", "0" * 64)
+    assert MethodRecord("ssi", False, "e", None, {}).label == "ssi"
+    assert MethodRecord(None, False, None, None, {}).label is None
+    for text in ("{", "[]", "{}", json.dumps({**document, "more": 1})):
+        (tmp_path / "method.json").write_text(text)
+        with pytest.raises(ValueError, match=r"method\.json is damaged .*leave the run out"):
+            MethodRecord.read(tmp_path)
