@@ -87,7 +87,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
-    """Pictures lead to themselves at full size; Sphinx's roles, as in SB3's docstrings, are not known to mkdocs."""
+    """Images lead to themselves at full size; Sphinx's roles, as in SB3's docstrings, are not known to mkdocs."""
     html = re.sub(r'(<img[^>]* src="([^"]+)"[^>]*>)', r'<a href="\2">\1</a>', html)
     return re.sub(r":(?:class|data|func|meth|mod):(?:<code>~?)", "<code>", html)
 

@@ -18,7 +18,6 @@ class EncoderCallback(BaseCallback):
     Also prints the content hash of the clips or scans that the training environment shows, if it has one, and lets
     torch reuse memory (:mod:`sb3_abisim.common.malloc`).
 
-    :param verbose: as in Stable-Baselines3
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
     :raises ValueError: when training starts, if the model was trained on the embeddings of another encoder
     """

@@ -57,7 +57,7 @@ def test_train_and_enjoy(
     run(monkeypatch, "train", *common, "-n", "300", "--seed", "1", "--conf-file", word, *small)
     out = capsys.readouterr().out
     state = "frozen" if method.endswith("frozen") else "fine-tuned" if hash else "trained from scratch"
-    # One line for each network with an encoder of its own.
+    # One line for each network with a separate encoder.
     assert out.count("Encoder ") == (2 if algo == "sac" else 1)
     assert f"hash {hash}" in out if hash else "random weights" in out
     assert state in out and (state == "frozen" or "| encoder/ " in out)

@@ -48,7 +48,7 @@ def test_every_step_is_shown_and_each_end_stays_for_a_second(run_folder, tmp_pat
     success = record(run_folder, tmp_path / "a.gif", n_episodes=2, seed=3)
     shown = frames(tmp_path / "a.gif")
     assert success in (0.0, 0.5, 1.0)
-    # Ten frames for nine steps, with the run's own time limit; the last one stays.
+    # Ten frames for nine steps, with the run's time limit; the last one stays.
     assert sum(duration for duration, _ in shown) == 2 * (10 + N_LAST - 1) * MILLISECONDS
     assert sum(duration >= N_LAST * MILLISECONDS for duration, _ in shown) == 2
 

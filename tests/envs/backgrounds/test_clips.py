@@ -60,7 +60,7 @@ class TestFrames:
 
 class TestSplitGroups:
     def test_disjoint_complete_and_independent_of_order(self):
-        names = [f"film{i}" for i in range(40)]
+        names = [f"movie{i}" for i in range(40)]
         train, eval_groups = split_groups(names, 0, 0.25)
         assert len(eval_groups) == 10 and train | eval_groups == set(names) and not train & eval_groups
         assert split_groups(reversed(names), 0, 0.25) == (train, eval_groups)

@@ -11,7 +11,7 @@ from sb3_abisim.envs.backgrounds.load import load_backgrounds
 class TestCache:
     def test_decoded_once_and_found_again_under_another_name(self, folder, cache, monkeypatch):
         for seed in range(2):
-            write_video(folder / f"film{seed}.mp4", seed)
+            write_video(folder / f"movie{seed}.mp4", seed)
         before = [clips.content_hash for clips in both(folder)]
         assert len(list(cache.glob("*.npy"))) == len(list(cache.iterdir())) // 2 == 2
         hashes = {clip.hash for clips in both(folder) for clip in clips.clips}

@@ -14,10 +14,10 @@ def listed(folder, **kwargs):
 
 class TestSplit:
     def test_groups_stay_together(self, folder):
-        for film in range(8):
+        for movie in range(8):
             for shot in range(3):
-                (folder / f"film{film}").mkdir(exist_ok=True)
-                (folder / f"film{film}" / f"{shot}.mp4").touch()
+                (folder / f"movie{movie}").mkdir(exist_ok=True)
+                (folder / f"movie{movie}" / f"{shot}.mp4").touch()
         names = ("Kitchen [abc-EFGH_12]-000.mp4", "x/Kitchen [abc-EFGH_12]-001.mp4", "y/abc-EFGH_12_000010_000020.mp4")
         for name in names:
             (folder / name).parent.mkdir(exist_ok=True)
@@ -28,7 +28,7 @@ class TestSplit:
         assert len(set(sides["eval"].values())) == 2  # a quarter of nine
         groups = sides["train"] | sides["eval"]
         assert {groups[name] for name in names} == {"abc-EFGH_12"}
-        assert groups["film3/1.mp4"] == "film3"
+        assert groups["movie3/1.mp4"] == "movie3"
         assert listed(folder, seed=1) != sides == listed(folder)
 
     def test_no_shared_frame(self, folder):
@@ -99,8 +99,8 @@ class TestSplit:
             find_sources(folder)
 
     def test_one_group_leaves_a_side_empty(self, folder):
-        write_video(folder / "film" / "1.mp4"), write_video(folder / "film" / "2.mp4", 1)
-        with pytest.raises(ValueError, match=r"2 clips.*one group, 'film'.*add another video"):
+        write_video(folder / "movie" / "1.mp4"), write_video(folder / "movie" / "2.mp4", 1)
+        with pytest.raises(ValueError, match=r"2 clips.*one group, 'movie'.*add another video"):
             load_backgrounds(folder)
 
     def test_an_empty_side(self, folder):

@@ -43,12 +43,12 @@ class TestDecoding:
 
     def test_video_frames_in_order_and_cropped_to_the_center(self, folder):
         for seed in range(3):
-            write_video(folder / f"film{seed}.mp4", seed)
+            write_video(folder / f"movie{seed}.mp4", seed)
         for clips in both(folder):
             for index, name in enumerate(clips.names):
                 frames = shown(clips, index).astype(int)
                 assert frames.shape == (64, 3, 64, 64)
-                expected = shade(int(name[4]), np.arange(64))
+                expected = shade(int(name[5]), np.arange(64))
                 assert np.abs(frames[:, :, 32, 32] - expected[:, None]).max() <= 8
                 assert np.abs(frames[:, :, 32, 2] - expected[:, None]).max() <= 12  # the black margin is cut off
 
