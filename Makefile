@@ -22,8 +22,9 @@ setup: $(VENV)/.installed  ## make .venv and install the package with its pinned
 demo: setup  ## collect, pretrain, train PPO, draw: the whole product in about ten minutes, into demo/
 	$(BIN)/sb3-abisim demo -o demo
 
+# In random order, over all processors, with one thread each.
 test: setup  ## the tests that CI runs
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 test-slow: setup  ## the tests that take minutes
 	$(BIN)/python -m pytest -m slow
@@ -46,11 +47,11 @@ docs: setup  ## the pages of docs/ as a site with the API's reference, into site
 
 bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
 	$(BIN)/python -m benchmarks.bench_envs
-	$(BIN)/python -m benchmarks.bench_pretrain
+	$(BIN)/python -m benchmarks.bench_pretraining
 	$(BIN)/python -m benchmarks.bench_memory
 	$(BIN)/python -m benchmarks.bench_frozen
-	$(BIN)/python -m benchmarks.bench_scan
-	$(BIN)/python -m benchmarks.bench_allocator
+	$(BIN)/python -m benchmarks.bench_scan_nav
+	$(BIN)/python -m benchmarks.bench_malloc
 
 figures: setup  ## make every figure of docs/figures.md again from the committed encoders; about a quarter of an hour
 	$(BIN)/sb3-abisim analyze all --images docs/images --numbers benchmarks/results

@@ -36,6 +36,6 @@ def test_links_out_of_the_docs_lead_into_the_site(site):
 def test_the_reference_knows_parameters_and_no_roles_are_left(site):
     html = (site / "api" / "index.html").read_text()
     text = re.sub(r"<[^>]+>", "", html)
-    assert 'id="sb3_abisim.rl.extractors.ActionBisimExtractor"' in html
+    assert 'id="sb3_abisim.rl.extractors.PretrainedExtractor"' in html
     assert "name of a shipped one such as" in text, "the description of PretrainedExtractor's parameter encoder"
     assert not re.search(r":(class|meth|func|mod|data):", text)

@@ -1,4 +1,4 @@
-"""Speed of ScanNav on one core, and of turning a house into a map: ``python -m benchmarks.bench_scan``.
+"""Speed of ScanNav on one core, and of turning a house into a map: ``python -m benchmarks.bench_scan_nav``.
 
 Times are of the process (CPU seconds), which other load on the machine disturbs least; the speed is that of the
 fastest turn. The house has at least 150,000 triangles.
@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.tables import machine, use_one_core, write_page
 
-RESULTS = Path(__file__).parent / "results" / "scan.json"
+RESULTS = Path(__file__).parent / "results" / "scan_nav.json"
 # (copies, actions): least steps/s; the bound holds for walking, where no time goes into goals seen for the first time.
 TARGETS = {(1, "walking"): 0, (6, "walking"): 8000, (64, "walking"): 8000, (64, "random"): 0}
 LONGEST, LARGEST = 5.0, 1024.0  # s and MB of preprocessing
@@ -83,7 +83,7 @@ def stepping(n: int, actions: str, rounds: int, calls: int) -> float:
 
 def main(argv: list[str] | None = None) -> None:
     """Measure and write the results; exits 1 where a target is missed."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_scan", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_scan_nav", description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="JSON file (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=5, help="turns of each (default: %(default)s)")
     args = parser.parse_args(argv)
@@ -100,7 +100,7 @@ def main(argv: list[str] | None = None) -> None:
     args.output.write_text(json.dumps(result, indent=1) + "\n")
     rows = [f"| {a} | {n} | {s:,.0f} | {TARGETS[n, a] or '':} |" for (n, a), s in speeds.items()]
     text = (
-        f"`python -m benchmarks.bench_scan` on {machine()}; CPU seconds. 128 x 128 RGB-D, five apartments. Walking: "
+        f"`python -m benchmarks.bench_scan_nav` on {machine()}; CPU seconds. 128 x 128 RGB-D, five apartments. Walking: "
         "random moves without stop; random: with stop, so that episodes last four steps and most of the time goes into "
         "resets."
     )

@@ -17,7 +17,7 @@ from typing import Any
 
 from benchmarks.tables import machine, use_one_core, write_page
 
-RESULTS = Path(__file__).parent / "results" / "pretrain.md"
+RESULTS = Path(__file__).parent / "results" / "pretraining.md"
 AIM = 3.0
 BATCH_SIZE = 256
 # (objective, lengths of chunks)
@@ -180,7 +180,7 @@ def shares(run: Any, n_updates: int) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> None:
     """Measure and write the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_pretrain", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_pretraining", description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="Markdown file (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=8, help="turns of each loop (default: %(default)s)")
     parser.add_argument("--updates", type=int, default=6, help="updates per turn (default: %(default)s)")
@@ -211,7 +211,7 @@ def main(argv: list[str] | None = None) -> None:
                     notes.append(f"* {label}: {parts}")
                     print(rows[-1], notes[-1], flush=True)
     text = (
-        f"`python -m benchmarks.bench_pretrain` on {machine()}, batches of {BATCH_SIZE}: transitions per second of "
+        f"`python -m benchmarks.bench_pretraining` on {machine()}, batches of {BATCH_SIZE}: transitions per second of "
         f"processor time in the fastest of {args.rounds} turns of {args.updates} updates. A product of two 1024 x 1024 "
         f"matrices reaches {peak:.0f} GFLOP/s on this core; the bound is the ratio that ours would have at that "
         "rate, with no time for anything but convolutions and products."

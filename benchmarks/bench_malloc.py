@@ -17,7 +17,7 @@ from typing import Any
 
 from benchmarks.tables import machine, use_one_core, write_page
 
-RESULTS = Path(__file__).parent / "results" / "allocator.md"
+RESULTS = Path(__file__).parent / "results" / "malloc.md"
 # Environment to (environments, arguments of PPO).
 SETTINGS: dict[str, tuple[int, dict[str, Any]]] = {
     "DistractorPointMaze-v0": (16, {"n_steps": 256, "batch_size": 256}),
@@ -50,7 +50,7 @@ def turn(env_id: str, keep: bool) -> dict[str, float]:
 
 def main(argv: list[str] | None = None) -> None:
     """Measure and write the table."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_allocator", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_malloc", description=__doc__)
     parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="Markdown file (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=3, help="turns of each setting (default: %(default)s)")
     parser.add_argument("--turn", nargs=2, metavar=("ID", "KEEP"), help="one turn, as JSON (what the others call)")
@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> None:
         best = {keep: {"speed": 0.0, "memory": 0.0} for keep in (False, True)}
         for _ in range(args.rounds):
             for keep, there in best.items():
-                command = [sys.executable, "-m", "benchmarks.bench_allocator", "--turn", env_id, str(keep)]
+                command = [sys.executable, "-m", "benchmarks.bench_malloc", "--turn", env_id, str(keep)]
                 output = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
                 result = json.loads(output.splitlines()[-1])
                 best[keep] = {name: max(value, result[name]) for name, value in there.items()}
@@ -72,7 +72,7 @@ def main(argv: list[str] | None = None) -> None:
         rows.append(f"| {env_id} | {speeds} | {plain['memory']:.2f} | {kept['memory']:.2f} |")
         print(rows[-1], flush=True)
     text = (
-        f"`python -m benchmarks.bench_allocator` on {machine()}: PPO on image observations, steps per second of "
+        f"`python -m benchmarks.bench_malloc` on {machine()}: PPO on image observations, steps per second of "
         f"processor time, fastest of {args.rounds} turns, and the most memory that was resident, in GB."
     )
     header = [
