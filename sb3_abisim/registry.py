@@ -1,8 +1,9 @@
 """What can be added by name: methods, networks, dataset readers, and what is known of an environment.
 
 The ground floor: nothing of this package is imported here. What the package itself brings registers itself when the
-folder that holds it is imported, which happens at the first look-up. Other packages register in the same way: by being
-imported (``--packages`` of every command), or by an entry point in the group ``sb3_abisim.plugins`` that names a module.
+folder that holds it is imported, which happens at the first look-up. Other packages register in the same way: by
+being imported (``--packages`` of every command), or by an entry point in the group ``sb3_abisim.plugins`` that names a
+module.
 """
 
 import functools
@@ -59,8 +60,8 @@ class Network:
     """An encoder's network.
 
     :param name: as in ``network=`` and in encoder files
-    :param factory: takes an observation space and keyword arguments (JSON types); gives any ``torch.nn.Module`` from float
-        images (batch, channels, height, width) in 0..1 to (batch, features_dim)
+    :param factory: takes an observation space and keyword arguments (JSON types); gives any ``torch.nn.Module`` from
+        float images (batch, channels, height, width) in 0..1 to (batch, features_dim)
     :param observation_shape: (channels, height, width) that it is the default for; None for none
     """
 
@@ -89,7 +90,7 @@ class EnvTraits:
 
     :param algo: rl-zoo3's name of the algorithm that a benchmark trains by default
     :param n_transitions: random-action transitions that a benchmark pretrains on by default
-    :param collect_kwargs: keyword arguments of the environment in data collection alone, where a random agent needs some
+    :param collect_kwargs: keyword arguments of the environment in data collection alone
     :param splits: values of its argument ``split``: the one for evaluation, the one for training, then others; empty
         without such an argument
     :param split_kwargs: names of the arguments that choose what training sees of a split; evaluation goes without them

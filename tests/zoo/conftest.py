@@ -1,4 +1,4 @@
-"""rl-zoo3 leaves its monitor files open when a run is refused: they are closed here, not in the middle of another test."""
+"""rl-zoo3 leaves its monitor files open when a run is refused. They are closed here, not during another test."""
 
 import gc
 import warnings
