@@ -354,3 +354,70 @@ def test_only_files_of_the_format_are_ever_cleaned_up() -> None:
     ours = ["frames-00000.npy", "factor_agent-00012.npy", "shard-00003.json", "ends-123456.npy"]
     others = ["frames.npy", "notes-00000.npy", "meta.json", "factor_-00001.npy", "shard-00003.json.bak"]
     assert [is_shard_file(name) for name in ours + others] == [True] * len(ours) + [False] * len(others)
+
+
+# What a mutation found to be free.
+
+
+def test_batches_are_of_their_split(folder: Path) -> None:
+    dataset = TransitionDataset(folder, eval_fraction=0.2)
+    for split in ("train", "eval"):
+        starts = dataset.valid_starts(split=split)  # type: ignore[arg-type]
+        seen = [row for batch in dataset.batches(1, split=split) for row in map(tuple, labels(batch.obs))]  # type: ignore[arg-type]
+        assert sorted(seen) == sorted(map(tuple, labels(dataset.frames(starts))))
+        others = set(map(tuple, labels(dataset.frames(dataset.valid_starts())))) - set(seen)
+        assert others, "the other split has transitions of its own"
+
+
+def test_the_first_pass_of_seed_0_is_the_default(dataset: TransitionDataset) -> None:
+    plain = as_rows(dataset.batches(16))
+    assert (as_rows(dataset.batches(16, seed=0, epoch=0)) == plain).all()
+    assert len(dataset.pairs()[0]) == len(dataset.pairs(1)[0])
+
+
+def test_single_transitions_are_permuted_as_ever(dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Encoders follow from this order: another one would make other weights of the same seed."""
+    monkeypatch.setattr(dataset, "_frames", lambda index: index)
+    starts = dataset.valid_starts()
+    order = np.random.Generator(np.random.PCG64(np.random.SeedSequence([7, 3]))).permutation(len(starts))
+    found = np.concatenate([batch.obs for batch in dataset.batches(1, seed=7, epoch=3)])
+    assert np.array_equal(found, starts[order])
+
+
+@pytest.mark.parametrize("chunk_length", [2, 5])
+def test_all_chunks_but_those_at_the_ends_have_their_length(
+    dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch, chunk_length: int
+) -> None:
+    monkeypatch.setattr(dataset, "_frames", lambda index: index)
+    starts = dataset.valid_starts()
+    last = np.flatnonzero(dataset.ends)
+    segment_of = np.searchsorted(last, np.arange(dataset.n_frames))
+    first_of = np.concatenate([[0], last[:-1] + 1])
+    places = []
+    for epoch in range(6):
+        (batch,) = dataset.batches(len(starts), epoch=epoch, chunk_length=chunk_length)
+        begins = batch.obs[np.r_[True, batch.obs[1:] != batch.obs[:-1] + 1]]
+        # Within a segment, chunks begin at places that are equal modulo their length, but for the segment's own start.
+        inner = begins[begins != first_of[segment_of[begins]]]
+        for segment in np.unique(segment_of[inner]):
+            offsets = (inner[segment_of[inner] == segment] - first_of[segment]) % chunk_length
+            assert len(set(offsets.tolist())) == 1
+            places.append((segment, int(offsets[0])))
+    # Each pass cuts anew, and a segment's cut does not follow from its place in the dataset.
+    assert len(set(places)) > len({segment for segment, _ in places})
+
+
+def test_what_is_out_of_range_is_named(dataset: TransitionDataset) -> None:
+    with pytest.raises(IndexError, match=rf"frame index {dataset.n_frames} is out of range, the dataset has"):
+        dataset.frames([dataset.n_frames])
+    with pytest.raises(IndexError, match=r"one-dimensional integers, got float64 of shape \(1,\)"):
+        dataset.frames([0.5])
+    for wrong in (1.0, 1.5, -0.1):
+        with pytest.raises(ValueError, match=r"eval_fraction must be in \[0, 1\)"):
+            TransitionDataset(dataset.path, eval_fraction=wrong)
+
+
+def test_a_split_without_a_pair_names_the_split(folder: Path) -> None:
+    dataset = TransitionDataset(folder, eval_fraction=0)
+    with pytest.raises(ValueError, match="no transition of 1 steps in split 'eval'"):
+        dataset.pairs(1, "eval")

@@ -177,3 +177,66 @@ def test_rliable_needs_this() -> None:
         )[1]["a"].tolist()
 
     assert interval() != interval()
+
+
+# What a report rests on, at the edges.
+
+
+def test_two_runs_have_an_interval() -> None:
+    mean, half = statistics.mean_and_interval(np.array([1.0, 3.0]))
+    # 12.7062 is the quantile for 1 degree of freedom; the standard deviation is the square root of 2.
+    assert float(mean) == 2 and float(half) == pytest.approx(12.7062, rel=1e-5)
+
+
+def test_one_run_has_as_many_missing_intervals_as_numbers() -> None:
+    assert statistics.mean_and_interval(np.zeros((1, 4, 3)))[1].shape == (4, 3)
+
+
+def test_a_threshold_is_reached_by_what_equals_it_up_to_the_horizon() -> None:
+    steps = np.array([10, 20, 30, 40])
+    assert statistics.steps_to_threshold(steps, np.full(4, 0.1) + 0.2, 0.3, 30) == 30
+    # The mean of the last three is 0.3 + 5.6e-17, and as much below for other orders.
+    assert statistics.steps_to_threshold(steps, np.array([0.0, 0.3, 0.3, 0.3]), 0.3 + 5e-10, 40) == 40
+
+
+def test_a_ratio_repeats_by_its_seed_and_is_the_95_percent_interval() -> None:
+    reference, baseline = np.array([100.0, 180.0, 130.0]), np.array([300.0, 210.0, 500.0, 260.0])
+    rng = np.random.default_rng(0)
+    a, b = (np.array([rng.choice(x, len(x)).mean() for _ in range(20000)]) for x in (reference, baseline))
+    ratio = statistics.steps_ratio(reference, baseline, (1000, 1000))
+    assert ratio == statistics.steps_ratio(reference, baseline, (1000, 1000), seed=0)
+    assert ratio != statistics.steps_ratio(reference, baseline, (1000, 1000), seed=1)
+    low, high = np.quantile(a / b, [0.025, 0.975])
+    assert abs(ratio.low - low) < 0.05 * low and abs(ratio.high - high) < 0.06 * high
+
+
+def test_a_ratio_of_runs_that_are_all_censored_is_said_to_be_none() -> None:
+    never = np.array([np.nan, np.nan])
+    ratio = statistics.steps_ratio(never, never, (70, 50))
+    assert np.isnan([ratio.value, ratio.low, ratio.high]).all()
+    assert (ratio.bound, ratio.reached, ratio.steps) == ("~", (0.0, 0.0), (70, 50))
+
+
+@pytest.mark.parametrize("sizes", [(1, 3), (3, 1)])
+def test_a_ratio_with_a_single_run_has_no_interval(sizes: tuple[int, int]) -> None:
+    ratio = statistics.steps_ratio(np.full(sizes[0], 50.0), np.full(sizes[1], 100.0), (200, 200))
+    assert ratio.value == 0.5 and np.isnan([ratio.low, ratio.high]).all()
+
+
+def test_area_of_one_and_of_two_evaluations() -> None:
+    values = np.array([[1.0, 5.0], [2.0, 2.0]])
+    assert statistics.area_under_curve(np.array([10]), values[:, :1]).tolist() == [1, 2]
+    assert statistics.area_under_curve(np.array([10, 30]), values).tolist() == [3, 2]
+
+
+def test_aggregates_take_the_seed_0_and_all_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert statistics.iqm(SCORES) == statistics.iqm(SCORES, seed=0) != statistics.iqm(SCORES, seed=1)
+    taus = np.linspace(0, 1, 3)
+    profiles = [statistics.performance_profiles(SCORES, taus, *seed)[1]["a"] for seed in ((), (0,), (1,))]
+    assert np.array_equal(profiles[0], profiles[1]) and not np.array_equal(profiles[0], profiles[2])
+    from rliable import library
+
+    seen = []
+    monkeypatch.setattr(library, "create_performance_profile", lambda *a, reps, **k: seen.append(reps) or ({}, {}))
+    statistics.performance_profiles(SCORES, taus)
+    assert seen == [N_RESAMPLES]
