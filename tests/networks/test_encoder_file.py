@@ -418,3 +418,24 @@ def test_check_prints_both_sides(path: Path) -> None:
         file.check(spaces.Box(0, 254, (3, 15, 15), np.uint8))
     with pytest.raises(ValueError, match=r"action_space.*float32.*Discrete"):
         file.check(SPACE, spaces.Discrete(4))
+
+
+def test_embeddings_that_are_all_zero_agree_with_themselves(tmp_path: Path) -> None:
+    encoder = seeded_encoder()
+    with th.no_grad():
+        for parameter in encoder.parameters():
+            parameter.zero_()
+    save(tmp_path / "zero", encoder)
+    assert not load_encoder(tmp_path / "zero").encoder(th.rand(1, 3, 15, 15)).any()
+
+
+@pytest.mark.parametrize("change", [lambda e: e[:, :5], lambda e: e[:3], lambda e: e.double()])
+def test_reference_embeddings_of_another_shape_or_type_are_refused(
+    path: Path, change: Callable[[th.Tensor], th.Tensor]
+) -> None:
+    def edit(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> None:
+        tensors["golden.embeddings"] = change(tensors["golden.embeddings"]).contiguous()
+
+    forge(path, edit)
+    with pytest.raises(EncoderFileError, match=r"the reference embeddings have shape \(\d, \d+\); copy it again"):
+        load_encoder(path)
