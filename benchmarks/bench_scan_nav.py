@@ -101,7 +101,8 @@ def main(argv: list[str] | None = None) -> None:
     rows = [f"| {a} | {n} | {s:,.0f} | {TARGETS[n, a] or '':} |" for (n, a), s in speeds.items()]
     text = (
         f"`python -m benchmarks.bench_scan_nav` on {machine()}; CPU seconds. 128 x 128 RGB-D, five apartments. "
-        "Walking: random moves without stop; random: with stop, so that episodes last four steps and most of the time goes into "
+        "Walking: random moves without stop; random: with stop, "
+        "so that episodes last four steps and most of the time goes into "
         "resets."
     )
     tail = (
