@@ -45,6 +45,7 @@ NAMES = {
     "acro": "ACROExtractor",
     "beta_vae": "BetaVAEExtractor",
     "curl": "CURLExtractor",
+    "foreign": "ForeignExtractor",
     "info_nce": "InfoNCEExtractor",
     "ssi": "SSIExtractor",
     "vanilla": "VanillaExtractor",
@@ -119,7 +120,7 @@ def test_damaged_file(path: Path) -> None:
         (spaces.Box(0, 255, (675,), np.uint8), "uint8 images"),
         (spaces.Discrete(3), "uint8 images"),
         (spaces.Dict({"image": SPACE}), "MultiInputPolicy"),
-        (spaces.Box(0, 255, (12, 15, 15), np.uint8), "12, 15, 15"),
+        (spaces.Box(0, 255, (15, 12, 3), np.uint8), "15, 12, 3"),
     ],
 )
 def test_observation_space(path: Path, extractor_class: Any, space: gym.Space[Any], match: str) -> None:
