@@ -172,7 +172,7 @@ def register_method(
     """Add a method; its features extractor is then importable from ``sb3_abisim``.
 
     :param name: the word of ``--objective`` and ``--conf-file``
-    :param objective: subclass of :class:`~sb3_abisim.objectives.base.Objective`; None for a method that pretrains nothing
+    :param objective: subclass of :class:`~sb3_abisim.objectives.base.Objective`; None for one that pretrains nothing
     :param label: what reports call it; None for ``name``
     :param extractor: name of its features extractor class; None for ``name`` in capitals, as ``MyMethodExtractor``
     :param base: the method whose encoder its objective takes as ``base_encoder``

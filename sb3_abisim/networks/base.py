@@ -15,7 +15,6 @@ from torch import nn
 
 from sb3_abisim.registry import get_network, import_network, is_import_path, networks
 
-
 # The least side of images for the network "nature".
 NATURE_SIZE = 36
 

@@ -205,9 +205,9 @@ def load_encoder(name: str | os.PathLike[str], network: str | None = None) -> En
         if reference.dtype != th.uint8 or list(reference.shape[1:]) != metadata["observation_space"]["shape"]:
             raise ValueError(f"reference batch {tuple(reference.shape)} is not of {metadata['observation_space']}")
         space = spaces.Box(0, 255, tuple(reference.shape[1:]), np.uint8)
-        network = document["network"]
-        _require_registered(path, network["name"])
-        encoder = _build(space, network, tensors)
+        spec = document["network"]
+        _require_registered(path, spec["name"])
+        encoder = _build(space, spec, tensors)
     except EncoderFileError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:

@@ -52,7 +52,7 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
             return
         if issubclass(asked_class, PretrainedExtractor):
             try:
-                hash = load_encoder(kwargs["encoder"]).hash
+                hash = load_encoder(kwargs["encoder"], kwargs.get("network")).hash
             except EncoderNotFoundError:
                 absent = True
         here = _name(asked_class, bool(kwargs.get("freeze", False)), hash)

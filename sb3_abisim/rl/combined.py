@@ -10,6 +10,7 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from torch import nn
 
+from sb3_abisim.networks.base import NATURE_SIZE
 from sb3_abisim.rl.extractors import EncoderExtractor
 
 
@@ -21,7 +22,7 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
     :param encoders: image key to encoder file, each as for :class:`~sb3_abisim.rl.extractors.EncoderExtractor`
     :param freeze: True keeps the encoders' weights as they are; False lets the RL algorithm train them
     :param networks: image key to ``network`` and ``network_kwargs`` of its encoder; what is not there is read from the
-        file. :func:`~sb3_abisim.rl.policy_kwargs.policy_kwargs` fills it in, so that saved models load without the files
+        file. :func:`~sb3_abisim.rl.policy_kwargs.policy_kwargs` fills it in: saved models then load without the files
     :param nature_cnn: whether images without an encoder get SB3's untrained ``NatureCNN``
     :param cnn_output_dim: size of its output, as in SB3
     :raises ValueError: for a space that is no dictionary, an encoder for what is no image, or an image without encoder
@@ -58,6 +59,11 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
             if key in encoders:
                 extractor = EncoderExtractor(space, encoders[key], freeze, **(networks or {}).get(key, {}))
             elif key in without:
+                if min((space.shape or ())[1:]) < NATURE_SIZE:
+                    raise ValueError(
+                        f"NatureCNN takes images of at least {NATURE_SIZE} pixels, channels first, but {key} has "
+                        f"{space.shape}; pretrain an encoder for it, which may be small"
+                    )
                 extractor = NatureCNN(space, features_dim=cnn_output_dim)
             extractors[key] = nn.Flatten() if extractor is None else extractor
             features_dim += get_flattened_obs_dim(space) if extractor is None else extractor.features_dim

@@ -29,7 +29,9 @@ def policy_kwargs(
     """
     taken = sorted(name for name in more if name.startswith("features_extractor_"))
     if taken:
-        raise ValueError(f"policy_kwargs sets {', '.join(taken)} from the file; leave it out, or write the dict by hand")
+        raise ValueError(
+            f"policy_kwargs sets {', '.join(taken)} from the file; leave it out, or write the dict by hand"
+        )
     extractor: type = EncoderExtractor
     kwargs: dict[str, Any]
     if isinstance(encoder, Mapping):

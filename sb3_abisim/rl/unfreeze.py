@@ -5,6 +5,7 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
 from sb3_abisim.rl.extractors import PretrainedExtractor
@@ -23,36 +24,39 @@ def unfreeze_encoder(model: BaseAlgorithm) -> None:
     frozen = [module for module in policy.modules() if isinstance(module, PretrainedExtractor) and module.frozen]
     if not frozen:
         raise ValueError("the model holds no frozen encoder; make one with freeze=True, or use it as it is")
-    new = {id(parameter) for extractor in frozen for parameter in extractor.unfreeze()}
-    for owner, trained in _optimizers(policy):
-        _extend(owner, trained, new, policy)
-    # For save and load, which build the extractors again.
     kwargs = copy.deepcopy(model.policy_kwargs)
-    kwargs["features_extractor_kwargs"]["freeze"] = False
+    arguments = kwargs.get("features_extractor_kwargs") or {}
+    if not arguments.get("freeze"):
+        raise ValueError(
+            f"features_extractor_kwargs of the model hold no freeze=True, but {arguments}: it could not be loaded "
+            "again; let the custom features extractor take freeze as an argument"
+        )
+    new = {id(parameter) for extractor in frozen for parameter in extractor.unfreeze()}
+    for owner, parameters in _optimizers(policy):
+        if any(id(parameter) in new for parameter in parameters):
+            old: th.optim.Optimizer = owner.optimizer
+            rate = old.param_groups[0]["lr"]
+            owner.optimizer = policy.optimizer_class(parameters, lr=rate, **policy.optimizer_kwargs)
+            owner.optimizer.state.update(old.state)
+    # For save and load, which build the extractors again.
+    arguments["freeze"] = False
     model.policy_kwargs = kwargs
-    policy.features_extractor_kwargs = kwargs["features_extractor_kwargs"]
+    policy.features_extractor_kwargs = arguments
 
 
-def _optimizers(policy: Any) -> list[tuple[nn.Module, list[tuple[str, nn.Parameter]]]]:
-    """The modules that own an optimizer, each with the parameters that SB3 lets it train, by name."""
-    found = []
-    for owner in (policy, getattr(policy, "actor", None), getattr(policy, "critic", None)):
+def _optimizers(policy: Any) -> list[tuple[Any, list[nn.Parameter]]]:
+    """The modules that own an optimizer, each with the parameters that SB3 builds it for."""
+    found: list[tuple[Any, list[nn.Parameter]]] = []
+    actor, critic = getattr(policy, "actor", None), getattr(policy, "critic", None)
+    owner: Any
+    for owner in (policy, actor, critic):
         if getattr(owner, "optimizer", None) is None:
             continue
         # Value-based policies optimize one of their two networks.
         network = getattr(policy, "q_net", None) or getattr(policy, "quantile_net", None) or owner
-        named = list(network.named_parameters())
-        if owner is getattr(policy, "critic", None) and policy.share_features_extractor:
-            named = [(name, parameter) for name, parameter in named if "features_extractor" not in name]
-        found.append((owner, named))
+        named = network.named_parameters()
+        # A shared extractor is the actor's, except in TD3, which gives it to both optimizers.
+        if owner is critic and policy.share_features_extractor and not isinstance(policy, TD3Policy):
+            named = ((name, parameter) for name, parameter in named if "features_extractor" not in name)
+        found.append((owner, [parameter for _, parameter in named]))
     return found
-
-
-def _extend(owner: Any, trained: list[tuple[str, nn.Parameter]], new: set[int], policy: Any) -> None:
-    old: th.optim.Optimizer = owner.optimizer
-    parameters = [parameter for _, parameter in trained]
-    if not new & {id(parameter) for parameter in parameters}:
-        return
-    rate = old.param_groups[0]["lr"]
-    owner.optimizer = policy.optimizer_class(parameters, lr=rate, **policy.optimizer_kwargs)
-    owner.optimizer.state.update(old.state)

@@ -160,16 +160,17 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         if not (isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor)):
             return MethodRecord(None, False, None, None, preprocessing)
         kwargs = self._policy_kwargs.get("features_extractor_kwargs") or {}
-        encoder, hash = kwargs.get("encoder"), None
+        encoder, hash, method = kwargs.get("encoder"), None, method_of(extractor)
         if encoder is not None:
             try:
-                hash = load_encoder(encoder).hash
+                file = load_encoder(encoder, kwargs.get("network"))
+                hash, method = file.hash, method or str(file.metadata["objective"])
             except EncoderNotFoundError:
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
         name = None if encoder is None else str(encoder)
-        return MethodRecord(method_of(extractor), bool(kwargs.get("freeze", False)), name, hash, preprocessing)
+        return MethodRecord(method, bool(kwargs.get("freeze", False)), name, hash, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does.

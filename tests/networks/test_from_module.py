@@ -109,7 +109,7 @@ def test_it_enters_extractors(tmp_path: Path, name: str) -> None:
     model = sb3.PPO("CnnPolicy", RandomImages(), n_steps=8, batch_size=8, policy_kwargs=policy_kwargs, device="cpu")
     model.learn(16)
     assert th.allclose(model.policy.features_extractor(X), net(X), atol=1e-6)
-    with pytest.raises(ValueError, match="trained by 'foreign'.*use ForeignExtractor"):
+    with pytest.raises(ValueError, match=r"trained by 'foreign'.*use ForeignExtractor"):
         sb3_abisim.SSIExtractor(SPACE, path, network="user_networks:Pooled")
 
 
