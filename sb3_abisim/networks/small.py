@@ -25,12 +25,12 @@ def make_small(observation_space: gym.Space[Any], features_dim: int = 256) -> nn
     n_channels, height, width = require_size("small", observation_space, MIN_SIZE)
     n_positions = math.prod(math.ceil(side / 4) for side in (height, width))
     return nn.Sequential(
-        nn.Conv2d(n_channels, 32, 3, padding=1, bias=False),
-        nn.GroupNorm(1, 32, eps=1e-8),
+        nn.Conv2d(n_channels, 16, 3, padding=1, bias=False),
+        nn.GroupNorm(1, 16, eps=1e-8),
+        nn.ReLU(),
+        nn.Conv2d(16, 32, 3, stride=2, padding=1),
         nn.ReLU(),
         nn.Conv2d(32, 64, 3, stride=2, padding=1),
-        nn.ReLU(),
-        nn.Conv2d(64, 64, 3, stride=2, padding=1),
         nn.ReLU(),
         nn.Flatten(),
         nn.Linear(64 * n_positions, features_dim),
