@@ -53,8 +53,13 @@ class Method:
 
     @property
     def is_pretrained(self) -> bool:
+        """Whether there is anything to pretrain."""
+        return self.objective is not None
+
+    @property
+    def has_encoder_file(self) -> bool:
         """Whether its encoder comes from a file; if not, the network starts from random weights."""
-        return self.objective is not None or self.trained_elsewhere
+        return self.is_pretrained or self.trained_elsewhere
 
 
 @dataclass(frozen=True)
@@ -251,7 +256,7 @@ def get_objective(name: str) -> Any:
     """
     objective = get_method(name).objective
     if objective is None:
-        known = ", ".join(key for key, method in methods().items() if method.objective)
+        known = ", ".join(key for key, method in methods().items() if method.is_pretrained)
         raise ValueError(f"no objective pretrains {name!r}, only {known}; give a file: {name}=FILE")
     return objective
 

@@ -333,12 +333,12 @@ def _is_class_of(method: Method, extractor: type) -> bool:
 
 @functools.cache
 def _class_of(method: Method) -> type[BaseEncoderExtractor]:
-    parent: type[BaseEncoderExtractor] = PretrainedExtractor if method.is_pretrained else VanillaExtractor
+    parent: type[BaseEncoderExtractor] = PretrainedExtractor if method.has_encoder_file else VanillaExtractor
     if method.extractor == parent.__name__:
         return parent
     attributes: dict[str, Any] = {"__module__": __name__}
     summary = f"The network without pretraining, for the method ``{method.name}``"
-    if method.is_pretrained:
+    if method.has_encoder_file:
         attributes["objective"] = method.name
         summary = f"An encoder pretrained by {method.label} (``--objective {method.name}``)"
         if method.trained_elsewhere:

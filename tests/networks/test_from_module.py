@@ -115,6 +115,6 @@ def test_it_enters_extractors(tmp_path: Path, name: str) -> None:
 
 def test_the_method_pretrains_nothing_and_needs_a_file() -> None:
     method = get_method("foreign")
-    assert method.is_pretrained and method.trained_elsewhere
+    assert method.has_encoder_file and not method.is_pretrained
     with pytest.raises(ValueError, match=r"no objective pretrains 'foreign', only .*; give a file: foreign=FILE"):
         get_objective("foreign")

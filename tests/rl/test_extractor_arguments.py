@@ -39,7 +39,9 @@ def batch_norm_path(tmp_path: Path) -> Path:
     return write(tmp_path / "bn.safetensors", "BatchNorm")
 
 
-EXTRACTORS: dict[str, Any] = {name: extractor_class(name) for name, method in methods().items() if method.is_pretrained}
+EXTRACTORS: dict[str, Any] = {
+    name: extractor_class(name) for name, method in methods().items() if method.has_encoder_file
+}
 NAMES = {
     "abisim": "ActionBisimExtractor",
     "acro": "ACROExtractor",
