@@ -173,8 +173,8 @@ class PretrainedExtractor(BaseEncoderExtractor):
         if file is not None:
             if self.objective is not None:
                 check_objective(file, self.objective)
-            elif network is None:
-                network, network_kwargs = _read_network(file, network_kwargs)
+            else:
+                network, network_kwargs = _read_network(file, network, network_kwargs)
             file.check(observation_space)
         module = _build_network(observation_space, network, network_kwargs or {}, file)
         super().__init__(observation_space, module)
@@ -256,15 +256,16 @@ class EncoderExtractor(PretrainedExtractor):
     """An encoder from a file, whatever objective has trained it, with the network that it has.
 
     A saved model keeps the arguments, not the file. Where the file is absent, ``load`` of Stable-Baselines3 can
-    rebuild the extractor only if ``network`` is given, as :func:`~sb3_abisim.rl.policy_kwargs.policy_kwargs` does, or
+    rebuild the extractor only if its network is given, as :func:`~sb3_abisim.rl.policy_kwargs.policy_kwargs` does, or
     is the default one.
 
     :param observation_space: uint8 images in 0..255, channels first; equal to that of pretraining
     :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
         ``hf://owner/repository/file.safetensors``
     :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
-    :param network: name of the network; None reads it from the file
-    :param network_kwargs: its keyword arguments
+    :param network: name of the network; None reads it from the file, unless that is a ``pkg.module:Factory``, which is
+        imported only if you name it
+    :param network_kwargs: its keyword arguments; None reads them from the file
     :raises ValueError: for a damaged file, or one of other observations or another network
     """
 
@@ -429,11 +430,13 @@ def stored_network(file: EncoderFile) -> dict[str, Any]:
     return {"network": stored["name"], "network_kwargs": stored["kwargs"]}
 
 
-def _read_network(file: EncoderFile, network_kwargs: dict[str, Any] | None) -> tuple[str, dict[str, Any]]:
+def _read_network(
+    file: EncoderFile, network: str | None, network_kwargs: dict[str, Any] | None
+) -> tuple[str | None, dict[str, Any] | None]:
+    """The file's network where the arguments say nothing else."""
     stored = _json_spec(file.encoder)
-    if network_kwargs not in (None, {}, stored["kwargs"]):
-        raise ValueError(f"network_kwargs={network_kwargs} differ from those in {file.path}; leave them out")
-    return stored["name"], stored["kwargs"]
+    agree = network in (None, stored["name"]) and network_kwargs in (None, stored["kwargs"])
+    return (stored["name"], stored["kwargs"]) if agree else (network, network_kwargs)
 
 
 def _json_spec(encoder: Encoder) -> dict[str, Any]:

@@ -45,9 +45,7 @@ def test_a_file_is_refused_until_the_user_names_its_network(tmp_path: Path) -> N
         "an extractor": lambda: sb3_abisim.ActionBisimExtractor(
             SPACE, str(path), network=NAME, network_kwargs={"width": 3}
         ),
-        "any extractor": lambda: sb3_abisim.EncoderExtractor(
-            SPACE, str(path), network=NAME, network_kwargs={"width": 3}
-        ),
+        "any extractor": lambda: sb3_abisim.EncoderExtractor(SPACE, str(path), network=NAME),
         "policy_kwargs": lambda: sb3_abisim.policy_kwargs(path, network=NAME),
     }
     for way, load in ways.items():
