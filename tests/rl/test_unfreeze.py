@@ -41,9 +41,10 @@ def test_training_goes_on_with_the_encoder(tmp_path: Path, name: str, other_shar
     never = build(name, path, False, other_sharing)
     assert list(map(shapes, optimizers(model.policy))) == list(map(shapes, optimizers(never.policy)))
     assert [n for n, _ in model.policy.named_parameters()] == [n for n, _ in never.policy.named_parameters()]
-    for optimizer in optimizers(model.policy):
-        for parameter, state in optimizer.state.items():
-            assert all(value is before[id(parameter)][key] for key, value in state.items())
+    after = {id(p): dict(o.state[p]) for o in optimizers(model.policy) for g in o.param_groups for p in g["params"]}
+    assert any(before.values()) and len(after) > len(before)
+    for parameter, state in before.items():
+        assert all(value is after[parameter][key] for key, value in state.items())
     assert kwargs["features_extractor_kwargs"]["freeze"] is True
     model.learn(24, reset_num_timesteps=False)
     for _, extractor in find_extractors(model.policy):
