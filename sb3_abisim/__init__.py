@@ -22,11 +22,16 @@ if TYPE_CHECKING:
     from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
     from sb3_abisim.networks.base import Encoder
     from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
+    from sb3_abisim.networks.from_module import from_module
     from sb3_abisim.objectives.base import Objective, TensorBatch
     from sb3_abisim.pretraining.pretrain import pretrain
     from sb3_abisim.rl.callbacks import EncoderCallback
+    from sb3_abisim.rl.combined import CombinedEncoderExtractor
+    from sb3_abisim.rl.extractors import EncoderExtractor
     from sb3_abisim.rl.merge import merge_encoder
     from sb3_abisim.rl.optimizers import EncoderLRAdam
+    from sb3_abisim.rl.policy_kwargs import policy_kwargs
+    from sb3_abisim.rl.unfreeze import unfreeze_encoder
     from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
 # Public name: the module that defines it.
@@ -36,8 +41,10 @@ _PUBLIC = {
     "TRUNCATED": "data.format",
     "BatchEnv": "envs.base",
     "BatchedVecEnv": "envs.sb3_vec_env",
+    "CombinedEncoderExtractor": "rl.combined",
     "Encoder": "networks.base",
     "EncoderCallback": "rl.callbacks",
+    "EncoderExtractor": "rl.extractors",
     "EncoderLRAdam": "rl.optimizers",
     "Objective": "objectives.base",
     "PointMazePixels": "envs.point_maze.pixel_wrapper",
@@ -47,10 +54,13 @@ _PUBLIC = {
     "TransitionDataset": "data.dataset",
     "VecEncodeObservations": "rl.vec_encode",
     "collect": "data.collect",
+    "from_module": "networks.from_module",
     "load_encoder": "networks.encoder_file",
     "merge_encoder": "rl.merge",
+    "policy_kwargs": "rl.policy_kwargs",
     "pretrain": "pretraining.pretrain",
     "save_encoder": "networks.encoder_file",
+    "unfreeze_encoder": "rl.unfreeze",
     "write_dataset": "data.writer",
 }
 _EXTRACTORS = "sb3_abisim.rl.extractors"
@@ -61,8 +71,10 @@ __all__ = [
     "TRUNCATED",
     "BatchEnv",
     "BatchedVecEnv",
+    "CombinedEncoderExtractor",
     "Encoder",
     "EncoderCallback",
+    "EncoderExtractor",
     "EncoderLRAdam",
     "EnvTraits",
     "Objective",
@@ -74,14 +86,17 @@ __all__ = [
     "VecEncodeObservations",
     "__version__",
     "collect",
+    "from_module",
     "load_encoder",
     "merge_encoder",
+    "policy_kwargs",
     "pretrain",
     "register_method",
     "register_network",
     "register_reader",
     "register_traits",
     "save_encoder",
+    "unfreeze_encoder",
     "write_dataset",
 ]
 

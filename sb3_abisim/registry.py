@@ -37,6 +37,7 @@ class Method:
     :param results: the terms that its row in the table of encoders shows
     :param hyperparams: YAML file of its pretraining settings by environment id; None for this package's
         ``hyperparams/pretrain/<name>.yml``, or where there is none for the defaults
+    :param trained_elsewhere: whether its encoders come from files that nothing here pretrains
     """
 
     name: str
@@ -48,11 +49,17 @@ class Method:
     curve: str
     results: tuple[str, ...]
     hyperparams: str | os.PathLike[str] | None
+    trained_elsewhere: bool = False
 
     @property
     def is_pretrained(self) -> bool:
-        """Whether there is anything to pretrain; if not, the network starts from random weights."""
+        """Whether there is anything to pretrain."""
         return self.objective is not None
+
+    @property
+    def has_encoder_file(self) -> bool:
+        """Whether its encoder comes from a file; if not, the network starts from random weights."""
+        return self.is_pretrained or self.trained_elsewhere
 
 
 @dataclass(frozen=True)
@@ -148,6 +155,7 @@ class _Records(Generic[RecordT]):
 
 _METHODS: _Records[Method] = _Records("method", "sb3_abisim.objectives")
 _NETWORKS: _Records[Network] = _Records("network", "sb3_abisim.networks")
+_IMPORTED_NETWORKS: dict[str, Network] = {}
 _READERS: _Records[Reader] = _Records("reader", "sb3_abisim.data.readers")
 _TRAITS: dict[str, EnvTraits] = {}
 _DEFAULT_TRAITS = EnvTraits()
@@ -164,11 +172,12 @@ def register_method(
     curve: str = "accuracy",
     results: tuple[str, ...] = ("accuracy",),
     hyperparams: str | os.PathLike[str] | None = None,
+    trained_elsewhere: bool = False,
 ) -> None:
     """Add a method; its features extractor is then importable from ``sb3_abisim``.
 
     :param name: the word of ``--objective`` and ``--conf-file``
-    :param objective: subclass of :class:`~sb3_abisim.objectives.base.Objective`; None for a method without pretraining
+    :param objective: subclass of :class:`~sb3_abisim.objectives.base.Objective`; None for one that pretrains nothing
     :param label: what reports call it; None for ``name``
     :param extractor: name of its features extractor class; None for ``name`` in capitals, as ``MyMethodExtractor``
     :param base: the method whose encoder its objective takes as ``base_encoder``
@@ -176,13 +185,16 @@ def register_method(
     :param curve: see :class:`Method`
     :param results: see :class:`Method`
     :param hyperparams: see :class:`Method`
+    :param trained_elsewhere: see :class:`Method`
     :raises ValueError: for a name that is taken or cannot be one
     """
     class_name = extractor or "".join(part.capitalize() for part in re.split(r"[_.-]", name)) + "Extractor"
     for other in _METHODS.by_name.values():
         if other.extractor == class_name:
             raise ValueError(f"{class_name} is the extractor of method {other.name!r}; give another with extractor=")
-    record = Method(name, objective, label or name, class_name, base, color, curve, results, hyperparams)
+    record = Method(
+        name, objective, label or name, class_name, base, color, curve, results, hyperparams, trained_elsewhere
+    )
     _METHODS.add(name, record)
 
 
@@ -250,17 +262,47 @@ def get_objective(name: str) -> Any:
 
 
 def networks() -> dict[str, Network]:
-    """All networks by name, in the order of registration."""
-    return _NETWORKS.all()
+    """All networks by name, in the order of registration; then those that the user has named by their import path."""
+    return {**_NETWORKS.all(), **_IMPORTED_NETWORKS}
 
 
 def get_network(name: str) -> Network:
     """The network of a name.
 
-    :param name: e.g. "PointMazeEncoder"
+    :param name: e.g. "nature"
     :raises ValueError: for an unknown one, naming those that are known
     """
-    return _NETWORKS.get(name)
+    return _IMPORTED_NETWORKS.get(name) or _NETWORKS.get(name)
+
+
+def is_import_path(name: str | None) -> bool:
+    """Whether a network's name is an import path, ``pkg.module:Factory``.
+
+    :param name: of a network, None for the default one
+    """
+    return name is not None and ":" in name
+
+
+def import_network(name: str) -> None:
+    """Import a network that the user names by its path; encoder files may name it from then on.
+
+    Never call this with a name from a file: importing a module runs it.
+
+    :param name: ``pkg.module:Factory``, a factory as for :func:`register_network`, such as a module's class
+    :raises ValueError: for something that cannot be imported or called
+    """
+    if name in _IMPORTED_NETWORKS:
+        return
+    module, _, attribute = name.partition(":")
+    try:
+        factory = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"cannot import the network {name!r} ({error}); give pkg.module:Factory, and install it or set PYTHONPATH"
+        ) from error
+    if not callable(factory):
+        raise ValueError(f"the network {name!r} is no factory but {factory!r}; name a class or a function")
+    _IMPORTED_NETWORKS[name] = Network(name, factory, None)
 
 
 def readers() -> dict[str, Reader]:

@@ -17,9 +17,10 @@ def collect_grids(tmp_path_factory):
     return folder
 
 
-def run(data, output, objective="ssi", callback=None, **settings):
+def run(data, output, objective="ssi", callback=None, keep_checkpoint=False, **settings):
     config = load_config(objective, "Nav2D-v0", {**SETTINGS, **settings})
-    return pretrain(objective, data, output, config, device="cpu", progress_bar=False, verbose=0, callback=callback)
+    quiet = {"device": "cpu", "progress_bar": False, "verbose": 0}
+    return pretrain(objective, data, output, config, callback=callback, keep_checkpoint=keep_checkpoint, **quiet)
 
 
 def make_run(data, objective="ssi", output=Path("x.safetensors"), **settings):

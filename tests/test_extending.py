@@ -119,6 +119,25 @@ def test_without_the_package_everything_is_refused_by_name(package: Path, tmp_pa
     assert len(refused.strip().splitlines()[-1]) > 0
 
 
+def test_a_network_is_named_by_its_import_path(package: Path, tmp_path: Path) -> None:
+    """Pretraining imports it because the user names it; the file alone does not have it imported."""
+    name, env = "my_package.networks:make_tiny", ["--env", "my/Dot-v0"]
+    run(package, tmp_path, "collect", "--packages", "my_package", *env, "-n", "1000", "-o", "data")
+    settings = ["-params", *SMALL_PRETRAIN, f"network:{name}", "network_kwargs.width:4"]
+    run(package, tmp_path, "pretrain", "--objective", "ssi", "--data", "data", "-o", "dot.safetensors", *settings)
+    assert json.loads((tmp_path / "dot.json").read_bytes())["features_dim"] == 32
+    words = ["--algo", "ppo", *env, "-n", "64", "--eval-freq", "-1", "-f", "logs", "-params", *SMALL_PPO]
+    for spec in ("ssi=dot.safetensors", "ssi=dot.safetensors,frozen"):
+        flag = ["--packages", "my_package"]
+        if not spec.endswith("frozen"):
+            refused = run(package, tmp_path, "train", *flag, *words, "--conf-file", spec, code=2)
+            assert f"--packages {name}" in refused
+        run(package, tmp_path, "train", *flag, name, *words, "--conf-file", spec)
+    # Of the first one, policy_kwargs say which network it is; a saved model is its user's own code anyway.
+    enjoy = ["enjoy", "--packages", "my_package", "--algo", "ppo", *env, "-f", "logs", "--no-render", "-n", "9"]
+    run(package, tmp_path, *enjoy, "--exp-id", "1")
+
+
 def test_a_broken_plugin_is_left_out_with_a_warning(tmp_path: Path) -> None:
     (tmp_path / "broken.py").write_text("raise RuntimeError('no such luck')\n")
     info = tmp_path / "broken-1.0.dist-info"

@@ -47,7 +47,7 @@ def _run_parser() -> argparse.ArgumentParser:
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
     parser.add_argument("--methods", nargs="+", metavar="METHOD[=ENCODER][,frozen]",
                         help=f"such as {', '.join(methods())}; without an encoder, it is pretrained; {{seed}} in an "
-                        "encoder's name becomes the seed of pretraining (default: all)")  # fmt: skip
+                        "encoder's name becomes the seed of pretraining (default: all but foreign)")  # fmt: skip
     parser.add_argument("--env", nargs="+", default=list(DEFAULT_ENV_IDS), metavar="ID",
                         help=f"registered ids (default: the paper's, {', '.join(DEFAULT_ENV_IDS)})")  # fmt: skip
     _add_budget(parser)
@@ -103,7 +103,9 @@ def _engine(args: argparse.Namespace) -> Engine:
 
 
 def _run(args: argparse.Namespace) -> None:
-    plan = _plan(args, args.methods or list(methods()), args.env, args.final_episodes)
+    # Nothing here pretrains the others; they need a file.
+    specs = args.methods or [name for name, method in methods().items() if not method.trained_elsewhere]
+    plan = _plan(args, specs, args.env, args.final_episodes)
     jobs, root = build(plan), Path(args.output)
     if args.dry_run:
         _list(root, jobs)

@@ -126,7 +126,7 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     given = {name: value for name, _, value in (word.partition(":") for word in words)}
     _check_params(algo, given)
     inputs: tuple[Job, ...] = ()
-    if method.encoder is None and get_method(method.name).is_pretrained:
+    if method.encoder is None and get_method(method.name).has_encoder_file:
         inputs = (encoder_job(plan, env_id, method.name, encoder_seed),)
     dataclasses.replace(method, encoder=inputs[0].output if inputs else method.encoder).hyperparameters(entry, given)
     _check_wrappers(plan, env_id, {**entry, **parse_pairs(words, "--params")}, bool(inputs))

@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sb3_abisim.registry import load_plugins
+from sb3_abisim.registry import import_network, is_import_path, load_plugins
 
 PROGRAM = "sb3-abisim"
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
@@ -47,18 +47,22 @@ def add_packages(parser: argparse.ArgumentParser) -> None:
     """
     parser.add_argument(
         "--packages", nargs="+", action="extend", default=[], metavar="MODULE",
-        help="imported first: modules that register environments, methods, networks or readers",
+        help="imported first: modules that register environments, methods, networks or readers; pkg.module:Factory "
+        "names a network, so that an encoder file may name it, too",
     )  # fmt: skip
 
 
 def import_packages(names: Sequence[str]) -> None:
     """Import modules that register something, and the plugins of installed packages.
 
-    :param names: of the modules
+    :param names: of the modules, and ``pkg.module:Factory`` of networks
     :raises ValueError: for one that cannot be imported
     """
     load_plugins()
     for name in names:
+        if is_import_path(name):
+            import_network(name)
+            continue
         try:
             importlib.import_module(name)
         except ImportError as error:

@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
-from sb3_abisim.registry import get_network, networks
+from sb3_abisim.registry import get_network, import_network, is_import_path, networks
+
+# The least side of images for the network "nature".
+NATURE_SIZE = 36
 
 
 class Encoder(nn.Module):
@@ -28,6 +31,9 @@ class Encoder(nn.Module):
     :param network_kwargs: keyword arguments of its factory, JSON types only
     :param input_shape: (channels, height, width) of the observations
     """
+
+    # Whether the weights come from an encoder file.
+    is_pretrained = False
 
     def __init__(
         self,
@@ -51,8 +57,12 @@ class Encoder(nn.Module):
     def apply(self, fn: Callable[[nn.Module], None]) -> "Encoder":
         """As in torch, whose ``orthogonal_`` (which SB3 initializes with) takes no weights with channels last.
 
+        Does nothing to weights that come from a file: whoever initializes an agent would overwrite them.
+
         :param fn: called on every submodule
         """
+        if self.is_pretrained:
+            return self
         set_memory_format(self, th.contiguous_format)
         super().apply(fn)
         set_memory_format(self, th.channels_last)
@@ -118,7 +128,8 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     """Build an encoder for an observation space.
 
     :param observation_space: a channels-first image space
-    :param name: of a registered network; None takes the one that is the default for the space's shape
+    :param name: of a registered network, or ``pkg.module:Factory``, which is imported: never a name that only a file
+        holds; None takes :func:`default_network`
     :param kwargs: keyword arguments of its factory
     :raises ValueError: for an unknown name or keyword, or a space that the network does not fit
     """
@@ -126,15 +137,9 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     if shape is None or len(shape) != 3:
         raise ValueError(f"observations must be images (channels, height, width), got {observation_space}")
     if name is None:
-        defaults = {key: network.observation_shape for key, network in networks().items() if network.observation_shape}
-        fitting = [key for key, observation_shape in defaults.items() if observation_shape == shape]
-        if not fitting:
-            known = ", ".join(f"{key} {observation_shape}" for key, observation_shape in defaults.items())
-            raise ValueError(
-                f"no default network for observations of shape {shape}; known are: {known}. Name a network, or "
-                "register a custom one with sb3_abisim.register_network"
-            )
-        name = fitting[0]
+        name = default_network(shape)
+    if is_import_path(name):
+        import_network(name)
     network = get_network(name)
     try:
         module = network.factory(observation_space, **kwargs)
@@ -147,6 +152,42 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     if shape != encoder.input_shape:
         raise ValueError(f"{name} takes observations of shape {encoder.input_shape}, got {shape}")
     return encoder
+
+
+def default_network(shape: tuple[int, ...]) -> str:
+    """The network for observations of a shape when none is named.
+
+    :param shape: (channels, height, width)
+    :return: the one registered for this shape; else "nature", or "small" for images under 36 pixels
+    :raises ValueError: for images with channels last
+    """
+    for name, network in networks().items():
+        if network.observation_shape == shape:
+            return name
+    if shape[2] < min(shape[:2]):
+        raise ValueError(
+            f"observations of shape {shape} have their channels last, encoders take them first; wrap the environment "
+            "in Stable-Baselines3's VecTransposeImage, or name a network"
+        )
+    return "nature" if min(shape[1:]) >= NATURE_SIZE else "small"
+
+
+def require_size(name: str, observation_space: gym.Space[Any], size: int) -> tuple[int, int, int]:
+    """Refuse images that are too small for a network.
+
+    :param name: of the network
+    :param observation_space: images, channels first
+    :param size: its least height and width
+    :return: (channels, height, width)
+    :raises ValueError: for smaller images
+    """
+    n_channels, height, width = observation_space.shape or ()
+    if min(height, width) < size:
+        raise ValueError(
+            f"{name} takes images of at least {size} x {size} pixels, got {height} x {width}; "
+            "name another network, such as small, or enlarge the images by a wrapper"
+        )
+    return n_channels, height, width
 
 
 def _features_dim(name: str, module: nn.Module, shape: tuple[int, ...]) -> int:

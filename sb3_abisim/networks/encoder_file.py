@@ -33,7 +33,7 @@ from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.spaces import space_to_json
 from sb3_abisim.common.vocabulary import current_env_kwargs, current_settings
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess
-from sb3_abisim.registry import networks
+from sb3_abisim.registry import import_network, is_import_path, networks
 
 FORMAT = 1
 # The embeddings of the reference batch may differ by this fraction of the largest one (other machine, other torch).
@@ -95,7 +95,7 @@ class EncoderFile:
         :raises ValueError: with both sides
         """
         sides = {"observation_space": _describe(observation_space)}
-        if action_space is not None:
+        if action_space is not None and self.metadata["action_space"] is not None:
             sides["action_space"] = space_to_json(action_space)
         for kind, here in sides.items():
             if here != self.metadata[kind]:
@@ -110,7 +110,7 @@ def save_encoder(
     encoder: Encoder,
     *,
     observation_space: gym.Space[Any],
-    action_space: gym.Space[Any],
+    action_space: gym.Space[Any] | None,
     env_id: str,
     env_kwargs: dict[str, Any],
     objective: str,
@@ -123,7 +123,7 @@ def save_encoder(
     :param path: the file; its folder must exist
     :param encoder: the trained network, on any device; it is left as it was
     :param observation_space: of the environment: uint8 images in 0..255, channels first
-    :param action_space: of the environment, ``Discrete`` or ``Box``
+    :param action_space: of the environment, ``Discrete`` or ``Box``; None where it is not known
     :param env_id: id of the environment that the data came from
     :param env_kwargs: its keyword arguments, JSON types
     :param objective: short name of the objective, e.g. "ssi"
@@ -146,7 +146,7 @@ def save_encoder(
         "network": encoder.spec(),
         _METADATA_KEY: {
             "observation_space": _describe(observation_space),
-            "action_space": space_to_json(action_space),
+            "action_space": None if action_space is None else space_to_json(action_space),
             "env_id": env_id,
             "env_kwargs": env_kwargs,
             "objective": objective,
@@ -170,16 +170,19 @@ def save_encoder(
     return hash
 
 
-def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
+def load_encoder(name: str | os.PathLike[str], network: str | None = None) -> EncoderFile:
     """Read and verify an encoder file.
 
     :param name: as for :func:`resolve_encoder`
+    :param network: ``pkg.module:Factory`` of a network that is imported first, for a file that names it
     :return: the encoder with its metadata, under today's names
     :raises EncoderNotFoundError: when there is no such file
     :raises EncoderFileError: when a bit has changed, the file is something else, its network is not registered, or its
         reference batch does not agree
     """
     path = resolve_encoder(name)
+    if network is not None and is_import_path(network):
+        import_network(network)
     if path.stat().st_size > MAX_FILE_BYTES:
         raise EncoderFileError(
             f"{path} has {path.stat().st_size} bytes, more than {MAX_FILE_BYTES}; not an encoder file"
@@ -202,9 +205,9 @@ def load_encoder(name: str | os.PathLike[str]) -> EncoderFile:
         if reference.dtype != th.uint8 or list(reference.shape[1:]) != metadata["observation_space"]["shape"]:
             raise ValueError(f"reference batch {tuple(reference.shape)} is not of {metadata['observation_space']}")
         space = spaces.Box(0, 255, tuple(reference.shape[1:]), np.uint8)
-        network = document["network"]
-        _require_registered(path, network["name"])
-        encoder = _build(space, network, tensors)
+        spec = document["network"]
+        _require_registered(path, spec["name"])
+        encoder = _build(space, spec, tensors)
     except EncoderFileError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:
@@ -311,7 +314,14 @@ def _verify_hash(path: Path, data: bytes, header: dict[str, Any]) -> str:
 
 
 def _require_registered(path: Path, name: Any) -> None:
-    if isinstance(name, str) and name not in networks():
+    if not isinstance(name, str):
+        return
+    if is_import_path(name) and name not in networks():
+        raise EncoderFileError(
+            f"{path} names the network {name!r}, which is imported only if you name it. If you trust it, add "
+            f"--packages {name} to the command, or network={name!r} in Python"
+        )
+    if name not in networks():
         raise EncoderFileError(
             f"{path} names the network {name!r}, which is not registered; known are {', '.join(networks())}. If you "
             "trust the package that registers it, name it with --packages on the command line, or import it"
@@ -335,6 +345,7 @@ def _build(space: spaces.Box, network: dict[str, Any], tensors: dict[str, th.Ten
         encoder = make_encoder(space, name, **kwargs)
     _require_fit(encoder, weights)
     encoder.load_state_dict(weights)
+    encoder.is_pretrained = True
     return encoder.eval()
 
 

@@ -69,10 +69,17 @@ def resnet18_layers(n_input_channels: int, image_size: int) -> nn.Sequential:
     :param image_size: height and width of the images
     """
     side = math.ceil(image_size / 2 / 32)
-    n_compressed = round(FEATURES_DIM / side**2)
+    return nn.Sequential(nn.AvgPool2d(2), resnet18_backbone(n_input_channels), *compression(side**2))
+
+
+def compression(n_positions: int, features_dim: int = FEATURES_DIM) -> nn.Sequential:
+    """The backbone's map to about ``features_dim`` numbers, the same number of channels at each position.
+
+    :param n_positions: of the map
+    :param features_dim: how many numbers, to a multiple of ``n_positions``
+    """
+    n_compressed = max(1, round(features_dim / n_positions))
     return nn.Sequential(
-        nn.AvgPool2d(2),
-        resnet18_backbone(n_input_channels),
         nn.Conv2d(BASE_PLANES * 8, n_compressed, 3, padding=1, bias=False),
         nn.GroupNorm(1, n_compressed),
         nn.ReLU(),

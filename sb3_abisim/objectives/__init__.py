@@ -10,3 +10,5 @@ for _module in pkgutil.iter_modules(__path__):
 
 # The baseline that pretrains nothing.
 register_method("vanilla", label="trained from scratch", extractor="VanillaExtractor", color="#D55E00")
+# Encoders of sb3_abisim.from_module.
+register_method("foreign", label="trained elsewhere", color="#999999", trained_elsewhere=True)

@@ -60,13 +60,39 @@ class Checkpoints:
         rows = [{current_term(name): value for name, value in row.items()} for row in metadata["rows"]]
         return metadata["n_updates"], rows
 
-    def remove(self) -> None:
-        """Remove them all: only an unfinished run needs them."""
-        for path in self._paths():
+    def remove(self, keep: int = 0) -> None:
+        """Remove them: only an unfinished run needs them, or one that is to get more updates.
+
+        :param keep: how many of the newest ones stay
+        """
+        paths = self._paths()
+        for path in paths[: len(paths) - keep]:
             path.unlink()
+
+    def exist(self) -> bool:
+        """Whether there are any."""
+        return bool(self._paths())
 
     def _paths(self) -> list[Path]:
         return sorted(self.folder.glob("checkpoint-*.safetensors"))
+
+
+def asks_for_more_updates(there: dict[str, Any], here: dict[str, Any]) -> bool:
+    """Whether a run differs from another one in nothing but a larger ``n_updates``.
+
+    :param there: settings of the other run
+    :param here: settings of the present run
+    """
+    there, here = (current_settings(json.loads(json.dumps(settings))) for settings in (there, here))
+    return {**there, "n_updates": None} == {**here, "n_updates": None} and there["n_updates"] < here["n_updates"]
+
+
+def rate_is_constant(settings: dict[str, Any]) -> bool:
+    """Whether the first updates of a longer run are those of a shorter one: its learning rate does not fall.
+
+    :param settings: of a run
+    """
+    return not isinstance(settings["learning_rate"], str)
 
 
 def refuse_other_settings(path: Path, there: dict[str, Any], here: dict[str, Any]) -> None:
@@ -108,7 +134,8 @@ def _read(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, settings
     tensors = load_tensors(content)
     header_size = int.from_bytes(content[:8], "little")
     metadata: dict[str, Any] = json.loads(json.loads(content[8 : 8 + header_size])["__metadata__"]["run"])
-    refuse_other_settings(path, metadata["settings"], settings)
+    if not (rate_is_constant(settings) and asks_for_more_updates(metadata["settings"], settings)):
+        refuse_other_settings(path, metadata["settings"], settings)
     module.load_state_dict({k.removeprefix("module."): v for k, v in tensors.items() if k.startswith("module.")})
     state: dict[int, dict[str, th.Tensor]] = {}
     for name, tensor in tensors.items():

@@ -34,6 +34,7 @@ def pretrain(
     progress_bar: bool = True,
     verbose: int = 1,
     callback: "Callback | None" = None,
+    keep_checkpoint: bool = False,
 ) -> Path:
     """Train an encoder and write its file and model card; go on where an interrupted call with equal arguments stopped.
 
@@ -50,6 +51,8 @@ def pretrain(
     :param verbose: 1 prints the log's rows
     :param callback: takes the encoder in evaluation mode at every row of the log and returns further numbers for it, by
         name; the encoder file does not depend on it
+    :param keep_checkpoint: keep the last checkpoint when the run ends. With a constant learning rate, the same call
+        with a larger ``n_updates`` then goes on from there, to the bytes of a run that had them from the start
     :return: the encoder file
     :raises ValueError: if the output belongs to other settings, or anything does not fit together
     :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
@@ -97,9 +100,9 @@ def pretrain(
     try:
         with folder_lock(folder):
             remove_temporaries(folder)
-            run = PretrainRun(objective, dataset, output, config, base, seed, device, callback)
+            run = PretrainRun(objective, dataset, output, config, base, seed, device, callback, keep_checkpoint)
             if run.is_finished():
-                run.checkpoints.remove()
+                run.clean_up()
                 if verbose:
                     print(f"{output} is finished already; nothing to do")
                 return output
@@ -168,6 +171,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         "-params", "--params", nargs="+", action="extend", default=[], metavar="NAME:VALUE",
         help="replace settings, such as n_updates:1000 objective_kwargs.c:0.9",
     )  # fmt: skip
+    parser.add_argument(
+        "--keep-checkpoint", action="store_true",
+        help="keep the last one when the run ends, so that it can be given more updates later",
+    )  # fmt: skip
     parser.add_argument("--verbose", type=int, default=1, choices=(0, 1), help="1 prints the log (default: 1)")
     run(parser, argv, _command, "interrupted; the same command goes on from the last checkpoint")
 
@@ -178,4 +185,7 @@ def _command(args: argparse.Namespace) -> None:
     if args.env is not None and env_id != args.env:
         raise ValueError(f"{data} was collected in {env_id}, not in {args.env}")
     config = load_config(args.objective, env_id, parse_pairs(args.params, "-params"))
-    pretrain(args.objective, data, args.output, config, args.base, args.seed, args.device, verbose=args.verbose)
+    pretrain(
+        args.objective, data, args.output, config, args.base, args.seed, args.device,
+        verbose=args.verbose, keep_checkpoint=args.keep_checkpoint,
+    )  # fmt: skip

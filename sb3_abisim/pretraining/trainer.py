@@ -18,7 +18,12 @@ from sb3_abisim.networks.base import Encoder, make_encoder, preprocess, set_memo
 from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
 from sb3_abisim.pretraining.card import make_card, warn_at_chance, write_card
-from sb3_abisim.pretraining.checkpoint import Checkpoints, refuse_other_settings
+from sb3_abisim.pretraining.checkpoint import (
+    Checkpoints,
+    asks_for_more_updates,
+    rate_is_constant,
+    refuse_other_settings,
+)
 from sb3_abisim.pretraining.config import FOLLOWING, N_EVAL_BATCHES, PretrainConfig
 from sb3_abisim.registry import get_objective
 
@@ -68,6 +73,7 @@ class PretrainRun:
     :param seed: of weights and batches
     :param device: as in Stable-Baselines3
     :param callback: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
+    :param keep_checkpoint: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
     """
 
     def __init__(
@@ -80,7 +86,9 @@ class PretrainRun:
         seed: int,
         device: str,
         callback: Callback | None = None,
+        keep_checkpoint: bool = False,
     ) -> None:
+        self.keep_checkpoint = keep_checkpoint
         self.dataset, self.output, self.config, self.seed = dataset, output, config, seed
         self.callback = callback
         self.folder = output.with_suffix(".run")
@@ -110,9 +118,9 @@ class PretrainRun:
         self.rows: list[dict[str, float]] = []
 
     def is_finished(self) -> bool:
-        """Whether the encoder file is there, made with the same settings.
+        """Whether the encoder file is there, made with the same settings; one that can be given more updates is not.
 
-        :raises ValueError: if it was made with others, or is damaged
+        :raises ValueError: if it was made with others, cannot be given more updates, or is damaged
         """
         if not self.output.exists():
             return False
@@ -120,8 +128,25 @@ class PretrainRun:
             settings = load_encoder(self.output).metadata["settings"]
         except EncoderFileError as error:
             raise ValueError(f"{error}. To have it written again, remove it first") from error
-        refuse_other_settings(self.output, settings, self.settings)
-        return True
+        if not asks_for_more_updates(settings, self.settings):
+            refuse_other_settings(self.output, settings, self.settings)
+            return True
+        reason = None
+        if not rate_is_constant(self.settings):
+            reason = f"at whose end its learning_rate {self.settings['learning_rate']} has fallen to 0"
+        elif not self.checkpoints.exist():
+            reason = f"and no checkpoint was kept in {self.folder}"
+        if reason is not None:
+            raise ValueError(
+                f"{self.output} has had its n_updates of {settings['n_updates']}, {reason}, so there is no going on to "
+                f"{self.settings['n_updates']}; choose another output (--keep-checkpoint with a constant "
+                "learning_rate lets a run go on later)"
+            )
+        return False
+
+    def clean_up(self) -> None:
+        """Remove the checkpoints of a finished run, except one that is to be kept."""
+        self.checkpoints.remove(keep=int(self.keep_checkpoint))
 
     def train(self, progress_bar: bool, verbose: int) -> None:
         """Train to the end, from the newest checkpoint if there is one, and write the results.
@@ -167,6 +192,8 @@ class PretrainRun:
 
     def finish(self) -> None:
         """Write the model card and, last, the encoder file; its presence says that the run is over."""
+        if self.keep_checkpoint and self._saved_at < self.n_updates:
+            self.save()
         dataset, encoder = self.dataset, self.module.encoder.cpu().eval()
         encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
         card = make_card(self.settings, self.config, dataset, self.module, self.rows, self.device.type)
@@ -183,7 +210,7 @@ class PretrainRun:
             dataset_hash=dataset.hash,
             reference_observations=self._some_frames(N_REFERENCE),
         )
-        self.checkpoints.remove()
+        self.clean_up()
         warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval())
 
     def _some_frames(self, n: int, split: Split | None = None) -> NDArray[np.uint8]:

@@ -6,10 +6,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
-from sb3_abisim.rl.extractors import EncoderExtractor, PretrainedExtractor
+from sb3_abisim.rl.extractors import BaseEncoderExtractor, PretrainedExtractor
 
 
-def find_extractors(policy: nn.Module) -> list[tuple[str, EncoderExtractor]]:
+def find_extractors(policy: nn.Module) -> list[tuple[str, BaseEncoderExtractor]]:
     """The extractors of a policy by name, each object once, without those of target networks.
 
     :param policy: ``model.policy``
@@ -17,7 +17,7 @@ def find_extractors(policy: nn.Module) -> list[tuple[str, EncoderExtractor]]:
     return [
         (name, module)
         for name, module in policy.named_modules()
-        if isinstance(module, EncoderExtractor) and not name.split(".")[0].endswith("_target")
+        if isinstance(module, BaseEncoderExtractor) and not name.split(".")[0].endswith("_target")
     ]
 
 
@@ -48,11 +48,11 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
     kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
     here, hash, absent = "none of our extractors", None, False
     if asked_class is not None:
-        if not (isinstance(asked_class, type) and issubclass(asked_class, EncoderExtractor)):
+        if not (isinstance(asked_class, type) and issubclass(asked_class, BaseEncoderExtractor)):
             return
         if issubclass(asked_class, PretrainedExtractor):
             try:
-                hash = load_encoder(kwargs["encoder"]).hash
+                hash = load_encoder(kwargs["encoder"], kwargs.get("network")).hash
             except EncoderNotFoundError:
                 absent = True
         here = _name(asked_class, bool(kwargs.get("freeze", False)), hash)
@@ -63,5 +63,5 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
         raise ValueError(f"it was trained with {' and '.join(sorted(there))}, not with {here}")
 
 
-def _name(extractor: type[EncoderExtractor], frozen: bool, hash: str | None) -> str:
+def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None) -> str:
     return extractor.__name__ + f", hash {hash}" * (hash is not None) + ", frozen" * frozen

@@ -32,8 +32,8 @@ from sb3_abisim.registry import Method, get_method, methods
 from sb3_abisim.rl.optimizers import mark_encoder
 
 
-class EncoderExtractor(BaseFeaturesExtractor):
-    """Hands an encoder's embedding, as it is, to the policy. Base of all extractors here.
+class BaseEncoderExtractor(BaseFeaturesExtractor):
+    """Hands an encoder's embedding, as it is, to the policy. Base of all extractors of one image here.
 
     :param observation_space: uint8 images in 0..255, channels first (SB3 transposes the others by itself)
     :param encoder: the network
@@ -101,7 +101,7 @@ class EncoderExtractor(BaseFeaturesExtractor):
         return th.cat([weights[name].flatten().float() for name in self._weight_names])
 
 
-class VanillaExtractor(EncoderExtractor):
+class VanillaExtractor(BaseEncoderExtractor):
     """The network without pretraining, the baseline. SB3 initializes and trains it like its own extractors.
 
     :param observation_space: uint8 images in 0..255, channels first
@@ -131,11 +131,12 @@ class VanillaExtractor(EncoderExtractor):
         return self
 
 
-class PretrainedExtractor(EncoderExtractor):
+class PretrainedExtractor(BaseEncoderExtractor):
     """An encoder from a file. Subclasses name the objective that must have trained it.
 
     The network follows from ``observation_space``, ``network`` and ``network_kwargs`` alone, never from the file, so
     that a saved model can be rebuilt where the file is absent; a file with another network is refused.
+    :class:`EncoderExtractor` reads it from the file.
 
     :param observation_space: uint8 images in 0..255, channels first; equal to that of pretraining
     :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
@@ -147,7 +148,8 @@ class PretrainedExtractor(EncoderExtractor):
     :raises ValueError: for a damaged file, or one of another objective, other observations or another network
     """
 
-    objective: ClassVar[str]
+    # None takes an encoder of any objective, with the network that it has.
+    objective: ClassVar[str | None] = None
 
     # 1 once the weights come from an encoder file, directly or through a saved model.
     weights_ready: th.Tensor
@@ -165,11 +167,14 @@ class PretrainedExtractor(EncoderExtractor):
         file: EncoderFile | None = None
         absence = ""
         try:
-            file = load_encoder(encoder)
+            file = load_encoder(encoder, network)
         except EncoderNotFoundError as error:
             absence = str(error)
         if file is not None:
-            check_objective(file, self.objective)
+            if self.objective is not None:
+                check_objective(file, self.objective)
+            else:
+                network, network_kwargs = _read_network(file, network, network_kwargs)
             file.check(observation_space)
         module = _build_network(observation_space, network, network_kwargs or {}, file)
         super().__init__(observation_space, module)
@@ -218,13 +223,54 @@ class PretrainedExtractor(EncoderExtractor):
         self.require_weights()
         super()._check_input(observations)
 
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
+    def unfreeze(self) -> list[nn.Parameter]:
+        """Make a frozen encoder's weights parameters again, so that they can be trained.
+
+        Optimizers that were built before do not hold them. For a model of Stable-Baselines3,
+        :func:`~sb3_abisim.rl.unfreeze.unfreeze_encoder` calls this and extends the optimizers.
+
+        :return: the new parameters, none if the encoder was not frozen
+        """
+        if not self.frozen:
+            return []
+        parameters = _buffers_to_parameters(self.encoder, self._weight_names)
+        self.frozen = False
+        mark_encoder(self.encoder)
+        self.encoder.train(self.training)
+        return parameters
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        weights = state_dict.get(f"{prefix}initial_weights")
+        if weights is not None and weights.shape != self.initial_weights.shape and not bool(self.weights_ready):
+            raise ValueError(
+                f"the saved model has another network ({weights.numel()} weights) than the extractor's arguments say "
+                f"({self.n_parameters}), and the encoder file {self.source!r} is not there to tell; put it there, or "
+                "make models with sb3_abisim.policy_kwargs(FILE), which keep the network"
+            )
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         # The loaded model may be one that never had its weights.
         self._input_checked = False
 
 
-def extractor_class(method: str) -> type[EncoderExtractor]:
+class EncoderExtractor(PretrainedExtractor):
+    """An encoder from a file, whatever objective has trained it, with the network that it has.
+
+    A saved model keeps the arguments, not the file. Where the file is absent, ``load`` of Stable-Baselines3 can
+    rebuild the extractor only if its network is given, as :func:`~sb3_abisim.rl.policy_kwargs.policy_kwargs` does, or
+    is the default one.
+
+    :param observation_space: uint8 images in 0..255, channels first; equal to that of pretraining
+    :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
+        ``hf://owner/repository/file.safetensors``
+    :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
+    :param network: name of the network; None reads it from the file, unless that is a ``pkg.module:Factory``, which is
+        imported only if you name it
+    :param network_kwargs: its keyword arguments; None reads them from the file
+    :raises ValueError: for a damaged file, or one of other observations or another network
+    """
+
+
+def extractor_class(method: str) -> type[BaseEncoderExtractor]:
     """The features extractor of a method, the same object at every call.
 
     :param method: a registered name, e.g. "ssi"
@@ -233,7 +279,7 @@ def extractor_class(method: str) -> type[EncoderExtractor]:
     return _class_of(get_method(method))
 
 
-def method_of(extractor: type[EncoderExtractor]) -> str | None:
+def method_of(extractor: type[BaseEncoderExtractor]) -> str | None:
     """The name of the method whose features extractor a class is; None for one that belongs to none.
 
     :param extractor: the class
@@ -247,15 +293,14 @@ def network_arguments(file: EncoderFile) -> dict[str, Any]:
     :param file: the encoder file
     :return: ``network`` and ``network_kwargs``; nothing for the default network of the observation's shape
     """
-    stored = _json_spec(file.encoder)
     space = space_from_json(file.metadata["observation_space"])
     try:
         # The weights drawn here are thrown away; the caller's random numbers must not depend on that.
         with th.random.fork_rng(devices=[]):
-            is_default = _json_spec(make_encoder(space)) == stored
+            is_default = _json_spec(make_encoder(space)) == _json_spec(file.encoder)
     except ValueError:
         is_default = False
-    return {} if is_default else {"network": stored["name"], "network_kwargs": stored["kwargs"]}
+    return {} if is_default else stored_network(file)
 
 
 def __getattr__(name: str) -> Any:
@@ -265,7 +310,7 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def _find_class(name: str, registered_by: str | None = None) -> type[EncoderExtractor]:
+def _find_class(name: str, registered_by: str | None = None) -> type[BaseEncoderExtractor]:
     """The features extractor of this name.
 
     :param name: of the class
@@ -288,15 +333,17 @@ def _is_class_of(method: Method, extractor: type) -> bool:
 
 
 @functools.cache
-def _class_of(method: Method) -> type[EncoderExtractor]:
-    parent: type[EncoderExtractor] = PretrainedExtractor if method.is_pretrained else VanillaExtractor
+def _class_of(method: Method) -> type[BaseEncoderExtractor]:
+    parent: type[BaseEncoderExtractor] = PretrainedExtractor if method.has_encoder_file else VanillaExtractor
     if method.extractor == parent.__name__:
         return parent
     attributes: dict[str, Any] = {"__module__": __name__}
     summary = f"The network without pretraining, for the method ``{method.name}``"
-    if method.is_pretrained:
+    if method.has_encoder_file:
         attributes["objective"] = method.name
         summary = f"An encoder pretrained by {method.label} (``--objective {method.name}``)"
+        if method.trained_elsewhere:
+            summary = "An encoder trained elsewhere (:func:`~sb3_abisim.networks.from_module.from_module`)"
     _, param, parameters = inspect.cleandoc(parent.__doc__ or "").partition(":param")
     attributes["__doc__"] = f"{summary}.\n\n{param}{parameters}\n"
     metaclass = type if _registered_by(method) is None else _ForeignType
@@ -328,8 +375,7 @@ copyreg.pickle(_ForeignType, _reduce_foreign)
 def _check_space(observation_space: gym.Space[Any]) -> None:
     if isinstance(observation_space, spaces.Dict):
         raise ValueError(
-            f"an encoder takes one image, got {observation_space}; build it on one key inside a custom extractor "
-            "for MultiInputPolicy"
+            f"an encoder takes one image, got {observation_space}; use CombinedEncoderExtractor with MultiInputPolicy"
         )
     if not is_image_space(observation_space):
         raise ValueError(
@@ -374,6 +420,25 @@ def _build_network(
     return encoder
 
 
+def stored_network(file: EncoderFile) -> dict[str, Any]:
+    """The network of a file as arguments of an extractor.
+
+    :param file: the encoder file
+    :return: ``network`` and ``network_kwargs``
+    """
+    stored = _json_spec(file.encoder)
+    return {"network": stored["name"], "network_kwargs": stored["kwargs"]}
+
+
+def _read_network(
+    file: EncoderFile, network: str | None, network_kwargs: dict[str, Any] | None
+) -> tuple[str | None, dict[str, Any] | None]:
+    """The file's network where the arguments say nothing else."""
+    stored = _json_spec(file.encoder)
+    agree = network in (None, stored["name"]) and network_kwargs in (None, stored["kwargs"])
+    return (stored["name"], stored["kwargs"]) if agree else (network, network_kwargs)
+
+
 def _json_spec(encoder: Encoder) -> dict[str, Any]:
     """The spec as a file gives it back (lists for tuples)."""
     spec: dict[str, Any] = json.loads(json.dumps(encoder.spec()))
@@ -386,3 +451,16 @@ def _parameters_to_buffers(module: nn.Module) -> None:
         for name, parameter in list(submodule.named_parameters(recurse=False)):
             delattr(submodule, name)
             submodule.register_buffer(name, parameter.detach().clone())
+
+
+def _buffers_to_parameters(module: nn.Module, names: list[str]) -> list[nn.Parameter]:
+    """The inverse, for weights of these names."""
+    parameters = []
+    for name in names:
+        path, _, attribute = name.rpartition(".")
+        submodule = module.get_submodule(path)
+        weights = submodule.get_buffer(attribute)
+        delattr(submodule, attribute)
+        parameters.append(nn.Parameter(weights.clone()))
+        submodule.register_parameter(attribute, parameters[-1])
+    return parameters

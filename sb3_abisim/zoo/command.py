@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import gymnasium as gym
 
 from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs
+from sb3_abisim.registry import is_import_path
 from sb3_abisim.zoo.manager import MethodExperimentManager
 from sb3_abisim.zoo.methods import grammar
 
@@ -53,8 +54,9 @@ def main(argv: Sequence[str]) -> None:
     try:
         words, packages = for_rl_zoo3(flags)
         import_packages(packages)
-        if packages and command in _WITH_PACKAGES:
-            words += ["--gym-packages", *packages]
+        modules = [name for name in packages if not is_import_path(name)]
+        if modules and command in _WITH_PACKAGES:
+            words += ["--gym-packages", *modules]
         sys.argv = [prog, *words]
         # rl_zoo3.plots imports its commands, which runpy would warn of.
         warnings.filterwarnings("ignore", "'rl_zoo3.plots", RuntimeWarning)

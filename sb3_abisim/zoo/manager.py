@@ -36,7 +36,7 @@ from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.checks import check_trained_with, find_extractors
-from sb3_abisim.rl.extractors import EncoderExtractor, method_of
+from sb3_abisim.rl.extractors import BaseEncoderExtractor, method_of
 from sb3_abisim.zoo.methods import (
     PREPROCESSING_KEYS,
     MethodRecord,
@@ -157,19 +157,20 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             file = load_encoder(encoding["encoder"])
             return MethodRecord(file.metadata["objective"], True, str(encoding["encoder"]), file.hash, preprocessing)
         extractor = self._policy_kwargs.get("features_extractor_class")
-        if not (isinstance(extractor, type) and issubclass(extractor, EncoderExtractor)):
+        if not (isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor)):
             return MethodRecord(None, False, None, None, preprocessing)
         kwargs = self._policy_kwargs.get("features_extractor_kwargs") or {}
-        encoder, hash = kwargs.get("encoder"), None
+        encoder, hash, method = kwargs.get("encoder"), None, method_of(extractor)
         if encoder is not None:
             try:
-                hash = load_encoder(encoder).hash
+                file = load_encoder(encoder, kwargs.get("network"))
+                hash, method = file.hash, method or str(file.metadata["objective"])
             except EncoderNotFoundError:
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
         name = None if encoder is None else str(encoder)
-        return MethodRecord(method_of(extractor), bool(kwargs.get("freeze", False)), name, hash, preprocessing)
+        return MethodRecord(method, bool(kwargs.get("freeze", False)), name, hash, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does.
@@ -204,7 +205,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     def hyperparameters_optimization(self) -> None:
         """As rl-zoo3 does, except that an extractor of ours survives a trial's ``policy_kwargs``."""
         extractor = (self._hyperparams.get("policy_kwargs") or {}).get("features_extractor_class")
-        if isinstance(extractor, type) and issubclass(extractor, EncoderExtractor):
+        if isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor):
             self._hyperparams = _KeepExtractor(self._hyperparams)
         MethodExperimentManager.has_begun = True
         super().hyperparameters_optimization()

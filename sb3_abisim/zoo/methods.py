@@ -50,7 +50,7 @@ class MethodSpec:
             raise ValueError(f"unknown method {self.name!r}; give {grammar()}")
         if self.encoder == "":
             raise ValueError(f"no encoder after '{self.name}='; give {grammar()}")
-        if not get_method(self.name).is_pretrained and (self.encoder is not None or self.frozen):
+        if not get_method(self.name).has_encoder_file and (self.encoder is not None or self.frozen):
             raise ValueError(
                 f"{self.name!r} trains its network from scratch: it takes neither an encoder nor ',frozen'"
             )
@@ -120,7 +120,7 @@ class MethodSpec:
         if self.frozen:
             return replaced
         replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
-        if method.is_pretrained:
+        if method.has_encoder_file:
             encoder = self._encoder(_encoder_name(kwargs))
             replaced["features_extractor_kwargs"] = {"encoder": encoder, **_network_arguments(encoder)}
         return replaced

@@ -39,12 +39,15 @@ def batch_norm_path(tmp_path: Path) -> Path:
     return write(tmp_path / "bn.safetensors", "BatchNorm")
 
 
-EXTRACTORS: dict[str, Any] = {name: extractor_class(name) for name, method in methods().items() if method.is_pretrained}
+EXTRACTORS: dict[str, Any] = {
+    name: extractor_class(name) for name, method in methods().items() if method.has_encoder_file
+}
 NAMES = {
     "abisim": "ActionBisimExtractor",
     "acro": "ACROExtractor",
     "beta_vae": "BetaVAEExtractor",
     "curl": "CURLExtractor",
+    "foreign": "ForeignExtractor",
     "info_nce": "InfoNCEExtractor",
     "ssi": "SSIExtractor",
     "vanilla": "VanillaExtractor",
@@ -119,7 +122,7 @@ def test_damaged_file(path: Path) -> None:
         (spaces.Box(0, 255, (675,), np.uint8), "uint8 images"),
         (spaces.Discrete(3), "uint8 images"),
         (spaces.Dict({"image": SPACE}), "MultiInputPolicy"),
-        (spaces.Box(0, 255, (12, 15, 15), np.uint8), "12, 15, 15"),
+        (spaces.Box(0, 255, (15, 12, 3), np.uint8), "15, 12, 3"),
     ],
 )
 def test_observation_space(path: Path, extractor_class: Any, space: gym.Space[Any], match: str) -> None:

@@ -99,12 +99,12 @@ PPO("CnnPolicy", "Nav2D-v0", policy_kwargs=kwargs, device="cpu").save({saved!r})
 
 def test_classes_of_another_packages_method(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(registry._METHODS, "by_name", methods())
-    registry.register_method("foreign", Foreign)
-    made: Any = extractor_class("foreign")
-    assert made.__name__ == "ForeignExtractor" and method_of(made) == "foreign" and made.objective == "foreign"
+    registry.register_method("other", Foreign)
+    made: Any = extractor_class("other")
+    assert made.__name__ == "OtherExtractor" and method_of(made) == "other" and made.objective == "other"
     data = cloudpickle.dumps(made)
     assert cloudpickle.loads(data) is made and copy.deepcopy(made) is made and b"test_extractor_pickles" in data
-    encoder = write(tmp_path / "e.safetensors", objective="foreign")
+    encoder = write(tmp_path / "e.safetensors", objective="other")
     kwargs = {"features_extractor_class": made, "features_extractor_kwargs": {"encoder": str(encoder)}}
     sb3.PPO("CnnPolicy", RandomImages(), policy_kwargs=kwargs, device="cpu").save(tmp_path / "model.zip")
     loaded: Any = sb3.PPO.load(tmp_path / "model.zip", device="cpu")

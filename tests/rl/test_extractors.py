@@ -21,7 +21,7 @@ from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.checks import find_extractors, require_weights
 from sb3_abisim.rl.extractors import (
     ActionBisimExtractor,
-    EncoderExtractor,
+    BaseEncoderExtractor,
     PretrainedExtractor,
     SSIExtractor,
     VanillaExtractor,
@@ -48,7 +48,7 @@ def all_extractors(model: BaseAlgorithm) -> list[PretrainedExtractor]:
     return [module for module in model.policy.modules() if isinstance(module, PretrainedExtractor)]
 
 
-def assert_equal_to_file(extractor: EncoderExtractor, path: Path) -> None:
+def assert_equal_to_file(extractor: BaseEncoderExtractor, path: Path) -> None:
     expected, actual = load_encoder(path).encoder.state_dict(), extractor.encoder.state_dict()
     assert expected.keys() == actual.keys()
     for name, value in expected.items():
@@ -308,7 +308,7 @@ def test_vanilla_and_pretrained_have_one_network(path: Path) -> None:
     after_vanilla = th.rand(3)
     th.manual_seed(0)
     pretrained = SSIExtractor(SPACE, str(write(path, objective="ssi")))
-    assert isinstance(vanilla, EncoderExtractor)
+    assert isinstance(vanilla, BaseEncoderExtractor)
     assert vanilla.encoder.spec() == pretrained.encoder.spec() and vanilla.n_parameters == pretrained.n_parameters
     th.manual_seed(0)
     SSIExtractor(SPACE, str(path))

@@ -1,0 +1,45 @@
+"""``policy_kwargs`` of Stable-Baselines3's algorithms, read from encoder files."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.rl.combined import CombinedEncoderExtractor
+from sb3_abisim.rl.extractors import EncoderExtractor, stored_network
+
+_File = str | os.PathLike[str]
+
+
+def policy_kwargs(
+    encoder: _File | Mapping[str, _File], freeze: bool = False, *, network: str | None = None, **more: Any
+) -> dict[str, Any]:
+    """``policy_kwargs`` for an encoder file; a new dictionary at every call, since SB3 writes into it.
+
+    What the file knows is read from it. Its network stands in the result, so that a saved model loads where the file
+    is absent.
+
+    :param encoder: as for :class:`~sb3_abisim.rl.extractors.EncoderExtractor`; for dictionary observations a mapping
+        of image keys to such files
+    :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
+    :param network: ``pkg.module:Factory``, for a file that names a network of yours, which is imported
+    :param more: further entries, such as ``net_arch``
+    :raises FileNotFoundError: if there is no such encoder
+    :raises ValueError: for a damaged file, or an entry that this function sets
+    """
+    taken = sorted(name for name in more if name.startswith("features_extractor_"))
+    if taken:
+        raise ValueError(
+            f"policy_kwargs sets {', '.join(taken)} from the file; leave it out, or write the dict by hand"
+        )
+    extractor: type = EncoderExtractor
+    kwargs: dict[str, Any]
+    if isinstance(encoder, Mapping):
+        extractor = CombinedEncoderExtractor
+        kwargs = {
+            "encoders": {key: os.fspath(file) for key, file in encoder.items()},
+            "networks": {key: stored_network(load_encoder(file, network)) for key, file in encoder.items()},
+        }
+    else:
+        kwargs = {"encoder": os.fspath(encoder), **stored_network(load_encoder(encoder, network))}
+    return {"features_extractor_class": extractor, "features_extractor_kwargs": {**kwargs, "freeze": freeze}, **more}
