@@ -66,6 +66,20 @@ class Objective(nn.Module):
             return actions
         return nn.functional.one_hot(actions, self.n_actions).float()
 
+    @classmethod
+    def base_network_kwargs(cls, network_kwargs: dict[str, Any]) -> dict[str, Any]:
+        """Arguments of the base encoder's network, where the base is pretrained first for this objective.
+
+        :param network_kwargs: of this objective's encoder
+        """
+        return network_kwargs
+
+    def prepare(self, observations: th.Tensor) -> None:
+        """Called once, before the first update. What it decides is kept in buffers.
+
+        :param observations: from all over the data to train on, float (n, channels, height, width) in 0..1
+        """
+
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """The scalar to minimize, and its named terms (detached) for the log.
 

@@ -81,14 +81,15 @@ def pretrain(
     if base_method is not None and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
         # Mistakes in the settings of this objective are found before the base is trained.
-        stand_in = make_encoder(dataset.observation_space, config.network, **config.network_kwargs)
+        base_network_kwargs = get_objective(objective).base_network_kwargs(config.network_kwargs)
+        stand_in = make_encoder(dataset.observation_space, config.network, **base_network_kwargs)
         make_objective(objective, dataset, config, stand_in)
         # Of the same network and data, whatever this one is asked to have.
         base_config = load_config(base_method, env_id)
         base_config = dataclasses.replace(
             base_config,
             network=config.network,
-            network_kwargs=config.network_kwargs,
+            network_kwargs=base_network_kwargs,
             eval_fraction=config.eval_fraction,
             batch_size=min(base_config.batch_size, config.batch_size),
         )

@@ -156,6 +156,9 @@ class PretrainRun:
         """
         th.manual_seed(self.seed)
         self.n_updates, self.rows = self.checkpoints.restore(self.module, self.optimizer)
+        if not self.n_updates:
+            frames = th.as_tensor(self._some_frames(N_STANDARDIZE, "train")).to(self.device)
+            self.module.prepare(preprocess(frames, self.dataset.observation_space))
         self._saved_at = self.n_updates
         logger = self._logger(verbose)
         sums: dict[str, float] = {}

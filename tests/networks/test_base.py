@@ -240,3 +240,42 @@ def test_the_memory_format_changes_no_weight():
         set_memory_format(module, memory_format)
         assert module.conv.weight.is_contiguous(memory_format=memory_format)
         assert all(th.equal(value, before[name]) for name, value in module.state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("shape", "kwargs", "features_dim"),
+    [
+        ((3, 15, 15), {"features": "trunk"}, 64 * 5 * 5),
+        ((3, 15, 15), {"hidden_dim": 12}, 12),
+        ((3, 64, 64), {"features": "trunk"}, 16 * 8 * 8),
+        ((3, 64, 64), {"features": "trunk", "hidden_dim": 12}, 12),
+        ((4, 128, 128), {"features": "trunk"}, 32 * 16 * 16),
+    ],
+)
+def test_the_papers_networks_hand_out_their_trunk_or_a_layer_on_top(shape, kwargs, features_dim) -> None:
+    space = image_space(*shape)
+    plain, encoder = make_encoder(space), make_encoder(space, None, **kwargs)
+    assert encoder.features_dim == features_dim
+    again = make_encoder(space, encoder.spec()["name"], **encoder.spec()["kwargs"])
+    assert again.spec() == encoder.spec() != plain.spec()
+    # The layers that both have are called alike, so that one can begin where the other ended.
+    shared = set(plain.state_dict()) & set(encoder.state_dict())
+    assert {"layers.0.weight", "layers.2.weight"} <= shared
+    x = th.rand(2, *shape)
+    with th.no_grad():
+        features = encoder(x)
+    assert features.shape == (2, features_dim)
+    if "hidden_dim" in kwargs:
+        assert float(features.min()) >= 0
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"features": "all"}, "features must be 'embedding' or 'trunk'"),
+        ({"hidden_dim": 0}, "hidden_dim must be a whole"),
+    ],
+)
+def test_other_features_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_encoder(image_space(3, 15, 15), None, **kwargs)

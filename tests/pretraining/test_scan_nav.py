@@ -6,7 +6,7 @@ from sb3_abisim.data.collect import collect
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.config import load_config
 from sb3_abisim.pretraining.pretrain import pretrain
-from sb3_abisim.registry import methods
+from sb3_abisim.registry import get_method, methods
 
 SETTINGS = {"n_updates": 4, "batch_size": 16, "log_interval": 2, "checkpoint_interval": 4, "eval_fraction": 0}
 
@@ -20,12 +20,12 @@ def data(tmp_path_factory):
 
 @pytest.mark.parametrize("objective", [name for name, method in methods().items() if method.is_pretrained])
 def test_objectives_of_the_small_encoder(data, tmp_path, objective):
-    base = "ScanNav-v0/ssi" if objective == "abisim" else None
+    base = "ScanNav-v0/ssi" if get_method(objective).base else None
     config = load_config(objective, "ScanNav-v0", SETTINGS)
     output = pretrain(objective, data, tmp_path / "x.safetensors", config, base, progress_bar=False, verbose=0)
     file = load_encoder(str(output))
     assert file.encoder.spec()["name"] == "ScanNavEncoder" and file.metadata["objective"] == objective
-    assert file.encoder.features_dim == 2048
+    assert file.encoder.features_dim == config.network_kwargs.get("hidden_dim", 2048)
 
 
 def test_the_residual_network(tmp_path):

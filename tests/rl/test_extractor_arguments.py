@@ -65,8 +65,8 @@ def test_every_method_has_an_extractor(method: str) -> None:
     assert method_of(type(NAMES[method], (PretrainedExtractor,), {})) is None
 
 
-def test_all_methods_are_named_here() -> None:
-    assert set(methods()) == set(NAMES)
+def test_the_methods_of_the_paper_keep_their_names() -> None:
+    assert set(NAMES) <= set(methods())
 
 
 @pytest.mark.parametrize("objective", EXTRACTORS)

@@ -1,0 +1,277 @@
+"""Goal progress: targets against loop-written derivations, an MDP solved by hand, and what each part is for."""
+
+import itertools
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from objective_inputs import CONTINUOUS, LineEncoder, change_weights
+from torch import nn
+
+from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.objectives.base import TensorBatch
+from sb3_abisim.objectives.goal_progress import (
+    HORIZON,
+    GoalHead,
+    GoalProgress,
+    goal_progress_loss,
+    progress_targets,
+    value_targets,
+)
+
+DISCRETE = gym.spaces.Discrete(3)
+N_STATES, GAMMA = 6, 0.8
+
+
+def make(action_space=DISCRETE, **kwargs) -> GoalProgress:
+    """With goals, and a target network that differs from the online one, as after some updates."""
+    th.manual_seed(0)
+    kwargs = {"n_goals": 5, "goal_share": 0.2, "warm_start": False} | kwargs
+    objective = GoalProgress(LineEncoder(7, 8), action_space, LineEncoder(4, 8), **kwargs)
+    objective.prepare(th.rand(30, 1, 1, 4))
+    change_weights(objective.target_encoder)
+    change_weights(objective.target_head, seed=5)
+    return objective
+
+
+def make_batch(action_space=DISCRETE, n=6) -> TensorBatch:
+    generator = th.Generator().manual_seed(2)
+    actions = (
+        th.randint(0, 3, (n,), generator=generator)
+        if isinstance(action_space, gym.spaces.Discrete)
+        else 2 * th.rand(n, 2, generator=generator) - 1
+    )
+    return TensorBatch.of(th.rand(n, 1, 1, 4, generator=generator), actions, th.rand(n, 1, 1, 4, generator=generator))
+
+
+def test_targets_equal_loops() -> None:
+    generator = np.random.default_rng(0)
+    values, next_values = generator.random((2, 4, 3))
+    values[0, 0], next_values[1, 1] = 1e-9, 1.0
+    least = GAMMA**HORIZON
+    expected = np.empty((4, 3))
+    for i, j in itertools.product(range(4), range(3)):
+        before = -math.log(max(values[i, j], least)) / math.log(1 / GAMMA)
+        after = -math.log(max(next_values[i, j], least)) / math.log(1 / GAMMA)
+        expected[i, j] = min(1.0, max(-1.0, before - after))
+    found = progress_targets(th.tensor(values), th.tensor(next_values), GAMMA)
+    assert np.allclose(found, expected) and (np.abs(expected) < 1).any()
+    assert np.allclose(value_targets(th.tensor(next_values), GAMMA), GAMMA * next_values)
+
+
+@pytest.mark.parametrize("action_space", [DISCRETE, CONTINUOUS])
+def test_the_loss_equals_a_loop(action_space: gym.Space) -> None:
+    objective, batch = make(action_space, value_weight=3.0, progress_weight=0.5), make_batch(action_space)
+    with th.no_grad():
+        loss, terms = objective.loss(batch)
+        total_value = total_progress = 0.0
+        for i, g in itertools.product(range(6), range(5)):
+            sides = []
+            for obs in (batch.obs[i : i + 1], batch.next_obs[i : i + 1]):
+                distance = (objective.base_encoder(obs)[0] - objective.goals[g]).abs().sum()
+                factors = objective.target_head.linear(objective.target_encoder(obs))[0].view(5, -1)[g]
+                if isinstance(action_space, gym.spaces.Discrete):
+                    best = max(factors.tolist())
+                else:
+                    corners = itertools.product((-1, 1), repeat=2)
+                    best = max(float(factors[0] + factors[1] * x + factors[2] * y) for x, y in corners)
+                sides.append(1.0 if distance <= objective.radii[g] else min(1.0, max(0.0, best)))
+            value, next_value = sides
+            least = 0.9**HORIZON
+            progress = (math.log(max(next_value, least)) - math.log(max(value, least))) / -math.log(0.9)
+            progress = min(1.0, max(-1.0, progress))
+            phi, action = objective.encoder(batch.obs[i : i + 1]), batch.actions[i]
+            terms_of = nn.functional.one_hot(action, 3).float() if action.dim() == 0 else th.cat([th.ones(1), action])
+            for head, target in ((objective.value_head, 0.9 * next_value), (objective.progress_head, progress)):
+                error = float((head.linear(phi)[0].view(5, -1)[g] * terms_of).sum()) - target
+                total_value += error**2 * (head is objective.value_head)
+                total_progress += error**2 * (head is objective.progress_head)
+    assert float(terms["value_loss"]) == pytest.approx(total_value / 30, rel=1e-4)
+    assert float(terms["progress_loss"]) == pytest.approx(total_progress / 30, rel=1e-4)
+    assert float(loss) == pytest.approx((3.0 * total_value + 0.5 * total_progress) / 30, rel=1e-4)
+
+
+def test_the_loss_of_unequal_weights() -> None:
+    ones, zeros = th.ones(2, 3), th.zeros(2, 3)
+    loss, _ = goal_progress_loss(2 * ones, zeros, 3 * ones, zeros, 10.0, 0.1)
+    assert float(loss) == pytest.approx(10 * 4 + 0.1 * 9)
+
+
+@pytest.mark.parametrize("action_space", [DISCRETE, CONTINUOUS])
+def test_gradients_reach_the_encoder_and_both_heads_alone(action_space: gym.Space) -> None:
+    objective = make(action_space)
+    objective.loss(make_batch(action_space))[0].backward()
+    moved = {name for name, parameter in objective.named_parameters() if parameter.grad is not None}
+    assert {name.split(".")[0] for name in moved} == {"encoder", "value_head", "progress_head"}
+
+
+def test_each_head_reaches_the_encoder() -> None:
+    for weights in ({"value_weight": 0.0}, {"progress_weight": 0.0}):
+        objective = make(**weights)
+        objective.loss(make_batch())[0].backward()
+        assert any(bool(parameter.grad.abs().max() > 0) for parameter in objective.encoder.parameters())
+
+
+def test_the_target_network_follows_by_tau() -> None:
+    objective = make(tau=0.25)
+    before = [p.clone() for p in (*objective.target_encoder.parameters(), *objective.target_head.parameters())]
+    online = [*objective.encoder.parameters(), *objective.value_head.parameters()]
+    objective.after_step()
+    after = [*objective.target_encoder.parameters(), *objective.target_head.parameters()]
+    for old, now, new in zip(before, online, after, strict=True):
+        assert th.allclose(new, 0.75 * old + 0.25 * now, atol=1e-6)
+
+
+# Goals.
+
+
+def test_each_goal_holds_its_share_of_the_states() -> None:
+    objective = make(n_goals=20, goal_share=0.1)
+    states = th.rand(500, 1, 1, 4, generator=th.Generator().manual_seed(3))
+    objective.prepare(states)
+    with th.no_grad():
+        inside = objective.in_goals(objective.base_encoder(states)).sum(dim=0)
+    # The state that the goal is made of counts beside them.
+    assert inside.tolist() == [51] * 20
+    assert len({tuple(goal) for goal in objective.goals.tolist()}) == 20
+
+
+def test_goals_follow_the_seed_and_need_enough_states() -> None:
+    objective, states = make(), th.rand(40, 1, 1, 4)
+    goals = []
+    for seed in (0, 0, 1):
+        th.manual_seed(seed)
+        objective.prepare(states)
+        goals.append(objective.goals.clone())
+    assert th.equal(goals[0], goals[1]) and not th.equal(goals[0], goals[2])
+    with pytest.raises(ValueError, match="n_goals=5, but there are 5 states to choose from; lower it"):
+        objective.prepare(states[:5])
+
+
+# An MDP solved by hand: a chain with a wall at each end, and three actions: left, stay, right.
+
+
+class ChainEncoder(Encoder):
+    """The state itself, one-hot: both heads are tables."""
+
+    def __init__(self) -> None:
+        super().__init__(nn.Flatten(), N_STATES, "ChainEncoder", {}, (1, 1, N_STATES))
+
+
+def chain() -> tuple[TensorBatch, np.ndarray]:
+    """All transitions, and the distance between any two states."""
+    pairs = list(itertools.product(range(N_STATES), range(3)))
+    following = [min(N_STATES - 1, max(0, s + a - 1)) for s, a in pairs]
+    onehot = th.eye(N_STATES).view(N_STATES, 1, 1, N_STATES)
+    obs, next_obs = onehot[[s for s, _ in pairs]], onehot[following]
+    states = np.arange(N_STATES)
+    return TensorBatch.of(obs, th.tensor([a for _, a in pairs]), next_obs), np.abs(states[:, None] - states)
+
+
+def solve(**kwargs) -> GoalProgress:
+    th.manual_seed(0)
+    encoder = ChainEncoder()
+    settings = {"n_goals": N_STATES - 1, "goal_share": 0.01, "gamma": GAMMA, "tau": 0.1, "warm_start": False} | kwargs
+    objective = GoalProgress(encoder, DISCRETE, ChainEncoder(), **settings)
+    objective.prepare(th.eye(N_STATES).view(N_STATES, 1, 1, N_STATES))
+    # Each goal is one state: the nearest other one is 2 away in the L1 norm.
+    objective.radii.fill_(0.5)
+    batch, _ = chain()
+    optimizer = th.optim.Adam(objective.parameters(), lr=0.03)
+    for update in range(1500):
+        for group in optimizer.param_groups:
+            group["lr"] = 0.03 * (1 - update / 1500)
+        loss, _ = objective.loss(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        objective.after_step()
+    return objective
+
+
+def test_values_converge_to_gamma_to_the_distance_and_progress_to_the_exact_one() -> None:
+    objective = solve()
+    batch, distance = chain()
+    goals = objective.goals.argmax(dim=1).numpy()
+    states, following = batch.obs.flatten(1).argmax(dim=1).numpy(), batch.next_obs.flatten(1).argmax(dim=1).numpy()
+    with th.no_grad():
+        values, _ = objective.values(batch)
+        progress = objective.progress_head.of_action(
+            objective.encoder(batch.obs), objective.action_terms(batch.actions)
+        )
+    assert np.allclose(values, GAMMA ** distance[states][:, goals], atol=0.02)
+    exact = distance[states][:, goals] - distance[following][:, goals]
+    assert np.allclose(progress, exact, atol=0.1)
+    # Blocked by a wall, or staying: nothing was gained.
+    still = states == following
+    assert still.sum() == 8 and np.allclose(progress[still], 0.0, atol=0.1)
+
+
+def test_a_blocked_move_is_an_exact_zero_before_anything_is_learned() -> None:
+    objective = make()
+    batch = make_batch()
+    still = TensorBatch.of(batch.obs, batch.actions, batch.obs)
+    values, next_values = objective.values(still)
+    assert th.equal(progress_targets(values, next_values, 0.9), th.zeros(6, 5))
+
+
+def test_without_the_progress_loss_the_progress_is_not_learned() -> None:
+    objective = solve(progress_weight=0.0)
+    batch, _ = chain()
+    assert float(objective.loss(batch)[1]["progress_r2"]) < 0.2
+    assert float(solve().loss(batch)[1]["progress_r2"]) > 0.95
+
+
+# Networks.
+
+
+def test_the_greedy_continuous_action_is_a_corner() -> None:
+    head = GoalHead(4, 3, None, 2)
+    phi = th.rand(5, 4)
+    grid = th.cartesian_prod(th.linspace(-1, 1, 5), th.linspace(-1, 1, 5))
+    with th.no_grad():
+        tried = th.stack([head.of_action(phi, th.cat([th.ones(1), a]).expand(5, 3)) for a in grid])
+        assert th.allclose(head.greedy(phi), tried.amax(dim=0), atol=1e-6)
+
+
+def test_continuous_actions_are_scaled_to_their_bounds() -> None:
+    space = gym.spaces.Box(np.array([0.0, 10.0], np.float32), np.array([4.0, 30.0], np.float32))
+    terms = make(space).action_terms(th.tensor([[0.0, 30.0], [2.0, 20.0]]))
+    assert terms.tolist() == [[1.0, -1.0, 1.0], [1.0, 0.0, 0.0]]
+
+
+def test_it_begins_with_the_layers_that_the_base_has() -> None:
+    space = gym.spaces.Box(0, 255, (3, 64, 64), np.uint8)
+    base = make_encoder(space)
+    encoder = make_encoder(space, None, features="trunk", hidden_dim=16)
+    fresh = encoder.state_dict()["layers.6.weight"].clone()
+    objective = GoalProgress(encoder, DISCRETE, base)
+    weights = objective.encoder.state_dict()
+    for name in ("layers.0.weight", "layers.2.bias"):
+        assert th.equal(weights[name], base.state_dict()[name])
+    assert th.equal(weights["layers.6.weight"], fresh)
+    with pytest.raises(ValueError, match="has no layer of its base"):
+        GoalProgress(LineEncoder(7, 8), DISCRETE, base)
+
+
+def test_the_base_is_the_plain_network() -> None:
+    kwargs = {"features_dim": 64, "features": "trunk", "hidden_dim": 512}
+    assert GoalProgress.base_network_kwargs(kwargs) == {"features_dim": 64}
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_goals": 0}, "n_goals must be a whole number"),
+        ({"goal_share": 1.0}, "goal_share must lie between 0 and 1, got 1.0"),
+        ({"gamma": 0.0}, "gamma must lie between 0 and 1"),
+        ({"tau": 0.0}, "tau must lie in"),
+        ({"value_weight": -1.0}, "value_weight must be a number of at least 0"),
+        ({"progress_weight": math.inf}, "progress_weight must be a number of at least 0"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(kwargs: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(**kwargs)
