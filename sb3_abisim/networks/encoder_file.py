@@ -123,7 +123,7 @@ def save_encoder(
     :param path: the file; its folder must exist
     :param encoder: the trained network, on any device; it is left as it was
     :param observation_space: of the environment: uint8 images in 0..255, channels first
-    :param action_space: of the environment, ``Discrete`` or ``Box``
+    :param action_space: of the environment
     :param env_id: id of the environment that the data came from
     :param env_kwargs: its keyword arguments, JSON types
     :param objective: short name of the objective, e.g. "ssi"
