@@ -229,6 +229,17 @@ def embed(encoder: Encoder, space: gym.Space[Any], observations: th.Tensor) -> t
     return embeddings.float().contiguous()
 
 
+def reference_batch(file: EncoderFile) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The observations in an encoder file, and their embeddings.
+
+    :param file: what :func:`load_encoder` returned
+    :return: uint8 (n, channels, height, width), and float32 (n, features_dim)
+    """
+    tensors = safetensors.torch.load_file(file.path)
+    observations, embeddings = (tensors[key].numpy() for key in _REFERENCE_KEYS)
+    return observations, embeddings
+
+
 def resolve_encoder(name: str | os.PathLike[str]) -> Path:
     """Find an encoder file.
 
