@@ -6,13 +6,13 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow format lint type check docs bench figures comparisons benchmark benchmark-smoke clean
+.PHONY: help setup demo test test-lowest test-slow format lint type check docs bench figures comparisons benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 $(VENV)/.installed: setup.cfg constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed (MuJoCo 4); set PYTHON=... ")'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed (setup.cfg); set PYTHON=... ")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e '.[tests]'
 	@touch $@
@@ -25,6 +25,15 @@ demo: setup  ## collect, pretrain, train PPO, draw: the whole product in about t
 # In random order, over all processors, with one thread each.
 test: setup  ## the tests that CI runs
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
+
+# In an environment of its own, whose other packages are the newest that the lowest ones go with.
+test-lowest: $(VENV)-lowest/.installed  ## the tests with the lowest versions that setup.cfg allows, into .venv-lowest/
+	OMP_NUM_THREADS=1 $(VENV)-lowest/bin/python -m pytest -n auto
+
+$(VENV)-lowest/.installed: setup.cfg constraints-lowest.txt
+	$(PYTHON) -m venv $(VENV)-lowest
+	$(VENV)-lowest/bin/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -c constraints-lowest.txt -e '.[tests]'
+	@touch $@
 
 test-slow: setup  ## the tests that take minutes
 	$(BIN)/python -m pytest -m slow
@@ -87,4 +96,4 @@ benchmark-smoke: setup  ## the same kinds of jobs and report with tiny budgets, 
 	$(BIN)/sb3-abisim benchmark -o benchmark-smoke $(SMOKE)
 
 clean:  ## remove the environment and caches
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	rm -rf $(VENV) $(VENV)-lowest .pytest_cache .mypy_cache .ruff_cache build *.egg-info

@@ -17,6 +17,7 @@ COMMANDS = {
     "enjoy": ("sb3_abisim.zoo.command", "watch a trained agent: rl-zoo3's enjoy"),
     "record": ("sb3_abisim.zoo.record", "record the agent that a run ended with as a GIF"),
     "merge": ("sb3_abisim.rl.merge", "put a frozen encoder into the model that was trained on its embeddings"),
+    "export": ("sb3_abisim.networks.export", "write an encoder as ONNX or a torch.export program"),
     "analyze": ("sb3_abisim.analysis.command", "show what an encoder sees: figures and numbers"),
     "benchmark": ("sb3_abisim.benchmark.command", "compare methods over environments and seeds, and report"),
     "zoo": ("sb3_abisim.zoo.command", "any other command of rl-zoo3, such as record_video or all_plots"),

@@ -15,8 +15,8 @@ class TransitionBatch(Generic[ArrayT]):
 
     :param frames: the observations, (m, C, H, W); uint8 in 0..255, or float in 0..1 after SB3's ``preprocess_obs``.
         One that several transitions share stands there once
-    :param actions: a_t: int64 (B,) for ``Discrete``, float32 (B, action_dim) for ``Box``; sequences a_t to a_{t+k-1}
-        have a second dimension k
+    :param actions: a_t, (B, *shape of an action), in the action space; int64 for ``Discrete``. Sequences a_t to
+        a_{t+k-1} have a second dimension k
     :param obs_index: where s_t stands among the frames, int64 (B,) or a slice
     :param next_obs_index: where s_{t+k} stands among them
     """

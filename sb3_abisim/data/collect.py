@@ -17,12 +17,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from sb3_abisim.common.cli import make_parser, parse_pairs, run
-from sb3_abisim.common.spaces import space_to_json
+from sb3_abisim.common.spaces import sample_actions, space_to_json
 from sb3_abisim.data.format import (
     CONTENT_HASH_KEY,
     CUT,
@@ -156,7 +155,7 @@ def collect_shard(
     n_envs = env.num_envs
     kept = n_transitions // n_envs + (np.arange(n_envs) < n_transitions % n_envs)
     reset_seed, action_seed = seed.spawn(2)
-    actions = _random_actions(env.single_action_space, (n_steps, n_envs), np.random.default_rng(action_seed))
+    actions = sample_actions(env.single_action_space, (n_steps, n_envs), np.random.default_rng(action_seed))
     observation, _ = env.reset(seed=reset_seed.generate_state(n_envs).tolist())
     # Frames that can be rendered again are not kept.
     rendered = _renders_factors(env)
@@ -262,13 +261,6 @@ def _steps_per_shard(env: VectorEnv[Any, Any, Any], env_id: str, env_kwargs: dic
             stacklevel=4,
         )
     return steps
-
-
-def _random_actions(space: gym.Space[Any], shape: tuple[int, int], generator: np.random.Generator) -> NDArray[Any]:
-    if isinstance(space, spaces.Discrete):
-        return generator.integers(space.start, space.start + space.n, size=shape, dtype=np.int64)
-    assert isinstance(space, spaces.Box)
-    return generator.uniform(space.low, space.high, size=(*shape, *space.shape)).astype(np.float32)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

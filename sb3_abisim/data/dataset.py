@@ -156,7 +156,7 @@ class TransitionDataset:
         return self._frames(self._check_index(index))
 
     def actions(self, index: Any) -> NDArray[Any]:
-        """Actions taken at the given frames, int64 [m] or float32 [m, A]; zero at a segment's last frame.
+        """Actions taken at the given frames, [m, *shape of an action]; zero at a segment's last frame.
 
         :param index: integers [m] in 0..n_frames - 1
         """

@@ -26,7 +26,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_abisim.common.spaces import is_channels_first
+from sb3_abisim.common.spaces import action_layout, check_action_space, is_channels_first, space_from_json
 
 FORMAT_VERSION = 1
 # Without frames, for environments that can render them from the factors.
@@ -128,10 +128,7 @@ def array_layout(identity: dict[str, Any], name: str) -> tuple[np.dtype[Any], tu
     if name == "ends":
         return np.dtype(np.uint8), ()
     if name == "actions":
-        space = identity["action_space"]
-        return (
-            (np.dtype(np.int64), ()) if space["type"] == "Discrete" else (np.dtype(np.float32), tuple(space["shape"]))
-        )
+        return action_layout(space_from_json(identity["action_space"]))
     layout = identity["factors"][name.removeprefix("factor_")]
     return np.dtype(layout["dtype"]), tuple(layout["shape"])
 
@@ -165,8 +162,8 @@ def check_spaces(observation_space: gym.Space[Any], action_space: gym.Space[Any]
 
     :param observation_space: of one environment
     :param action_space: of one environment
-    :raises ValueError: unless observations are uint8 images, channels first, in 0..255, and actions are ``Discrete`` or
-        a bounded float32 ``Box``
+    :raises ValueError: unless observations are uint8 images, channels first, in 0..255, and actions are as
+        :func:`~sb3_abisim.common.spaces.check_action_space` asks
     """
     shape = observation_space.shape or ()
     if not isinstance(observation_space, spaces.Box) or observation_space.dtype != np.uint8 or len(shape) != 3:
@@ -180,12 +177,7 @@ def check_spaces(observation_space: gym.Space[Any], action_space: gym.Space[Any]
         )
     if observation_space.low.min() != 0 or observation_space.high.max() != 255:
         raise ValueError(f"observations must be images in 0..255, got {observation_space}")
-    if isinstance(action_space, spaces.Discrete):
-        return
-    if not isinstance(action_space, spaces.Box) or action_space.dtype != np.float32:
-        raise ValueError(f"actions must be Discrete or a float32 Box, got {action_space}")
-    if not action_space.is_bounded("both"):
-        raise ValueError(f"uniformly random actions need bounds, got {action_space}; rescale it with a wrapper")
+    check_action_space(action_space)
 
 
 def to_json_bytes(document: dict[str, Any]) -> bytes:

@@ -14,12 +14,11 @@ from typing import Any, BinaryIO
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_abisim._version import __version__
 from sb3_abisim.common.files import LOCK_NAME, file_hash, folder_lock, is_temporary, remove_temporaries, write_atomic
-from sb3_abisim.common.spaces import space_to_json
+from sb3_abisim.common.spaces import fit_actions, space_to_json
 from sb3_abisim.common.vocabulary import current_env_kwargs
 from sb3_abisim.data.format import (
     CONFIG_NAME,
@@ -110,7 +109,7 @@ def write_dataset(
     :param segments: episodes, or parts of them, at least one; an iterator's are in memory shard by shard
     :param env_id: id of the environment that they were recorded in, or any name
     :param observation_space: of one environment: uint8 images in 0..255, channels first
-    :param action_space: of one environment: ``Discrete``, or a bounded float32 ``Box``
+    :param action_space: of one environment: as :func:`~sb3_abisim.common.spaces.check_action_space` asks
     :param source: where they come from, JSON types; not None, which stands for data that was collected here
     :param env_kwargs: keyword arguments of the environment, JSON types
     :param policy: what chose the actions
@@ -156,31 +155,6 @@ def _fitting(segments: Iterable[Segment], action_space: gym.Space[Any]) -> Itera
                 "and an end that is TERMINATED, TRUNCATED or CUT"
             )
         yield dataclasses.replace(segment, actions=actions)
-
-
-def fit_actions(actions: Any, action_space: gym.Space[Any], where: str) -> NDArray[Any]:
-    """Actions as a dataset holds them.
-
-    :param actions: of one segment, [L] or [L, 1] integers, or float32 [L, ...]
-    :param action_space: of one environment
-    :param where: of what they are, for messages
-    :return: int64 [L] or float32 [L, ...]
-    :raises ValueError: if they are not in the action space
-    """
-    array = np.asarray(actions)
-    if isinstance(action_space, spaces.Discrete):
-        array = array.reshape(len(array)) if array.size == len(array) else array
-        low, high = action_space.start, action_space.start + action_space.n - 1
-        fits = array.dtype.kind in "iu" and array.ndim == 1
-    else:
-        assert isinstance(action_space, spaces.Box)
-        low, high = action_space.low, action_space.high
-        fits = array.dtype == np.float32 and array.shape[1:] == action_space.shape
-    if not fits or not ((array >= low) & (array <= high)).all():
-        raise ValueError(
-            f"{where} has actions ({array.dtype}, {array.shape}) that are not in the action space {action_space}"
-        )
-    return array.astype(np.int64) if isinstance(action_space, spaces.Discrete) else array
 
 
 def write_segments(folder: Path, segments: Iterable[Segment], identity: dict[str, Any]) -> str:

@@ -123,7 +123,7 @@ def save_encoder(
     :param path: the file; its folder must exist
     :param encoder: the trained network, on any device; it is left as it was
     :param observation_space: of the environment: uint8 images in 0..255, channels first
-    :param action_space: of the environment, ``Discrete`` or ``Box``; None where it is not known
+    :param action_space: of the environment; None where it is not known
     :param env_id: id of the environment that the data came from
     :param env_kwargs: its keyword arguments, JSON types
     :param objective: short name of the objective, e.g. "ssi"
@@ -230,6 +230,17 @@ def embed(encoder: Encoder, space: gym.Space[Any], observations: th.Tensor) -> t
     """
     embeddings: th.Tensor = encoder(preprocess(observations, space))
     return embeddings.float().contiguous()
+
+
+def reference_batch(file: EncoderFile) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The observations in an encoder file, and their embeddings.
+
+    :param file: what :func:`load_encoder` returned
+    :return: uint8 (n, channels, height, width), and float32 (n, features_dim)
+    """
+    tensors = safetensors.torch.load_file(file.path)
+    observations, embeddings = (tensors[key].numpy() for key in _REFERENCE_KEYS)
+    return observations, embeddings
 
 
 def resolve_encoder(name: str | os.PathLike[str]) -> Path:

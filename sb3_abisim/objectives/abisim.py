@@ -14,13 +14,13 @@ tau                   ``tau``                         rate of the moving average
 Pairs of states are sampled among those of a batch, many more pairs than states: distances between n embeddings cost
 little beside the n embeddings. There are two expectations over actions:
 
-* ``expectation="uniform"``: the forward model predicts the next embedding for all discrete actions, or for
-  ``n_action_samples`` uniform continuous ones, the same for both states (Eq. 7).
+* ``expectation="uniform"``: the forward model predicts the next embedding for all ``Discrete`` actions, or for
+  ``n_action_samples`` uniform ones of another space, the same for both states (Eq. 7).
 * ``expectation="behavior"``: pairs are transitions that took the same action, and the target uses the next states
-  of the data. No forward model stands in the target. For continuous actions, a pair's actions differ by at most
-  ``action_radius`` in the L2 norm. The target is then one sample of the expectation, so its loss must be the squared
-  one: the minimizer of the paper's absolute difference would be the median over actions, and an obstacle that
-  blocks one of four moves would not count.
+  of the data. No forward model stands in the target. Actions are the same if all components are equal; those of a
+  ``Box`` differ by at most ``action_radius`` in the L2 norm. The target is then one sample of the expectation, so its
+  loss must be the squared one: the minimizer of the paper's absolute difference would be the median over actions, and
+  an obstacle that blocks one of four moves would not count.
 
 There are two ways to choose the pairs:
 
@@ -90,18 +90,6 @@ def relative_scale(base_distance: th.Tensor) -> th.Tensor:
     return mean / (base_distance + NEAREST_FLOOR * mean).clamp_min(th.finfo(mean.dtype).tiny)
 
 
-def same_action_pairs(actions: th.Tensor, radius: float) -> th.Tensor:
-    """Which pairs of transitions took the same action.
-
-    :param actions: int64 (batch,), or float32 (batch, action_dim)
-    :param radius: largest L2 distance that counts as the same, for continuous actions
-    :return: bool (batch, batch)
-    """
-    if actions.dim() == 1:
-        return actions[:, None] == actions[None]
-    return th.cdist(actions, actions) <= radius
-
-
 class ForwardModel(nn.Module):
     """Gaussian model of the next embedding: ``N(mean, diag(std^2))`` given an embedding and an action.
 
@@ -144,7 +132,7 @@ class ActionBisimulation(Objective):
     """Make L1 distances of embeddings equal the action-bisimulation metric.
 
     :param encoder: the network to pretrain
-    :param action_space: ``Discrete`` or one-dimensional ``Box``
+    :param action_space: as for :class:`~sb3_abisim.objectives.base.Objective`
     :param base_encoder: any trained encoder; frozen here
     :param c: weight of the recursive step, 0 <= c < 1
     :param tau: rate of the target encoder, per update; the smaller, the more updates it takes to look ahead
@@ -155,8 +143,9 @@ class ActionBisimulation(Objective):
         silences them
     :param pairs: "random" or "nearest" (module docstring)
     :param n_pairs: pairs of states per update
-    :param n_action_samples: continuous actions per update for "uniform"
-    :param action_radius: see :func:`same_action_pairs`, for continuous "behavior"
+    :param n_action_samples: actions per update for "uniform", where they are not ``Discrete``
+    :param action_radius: for "behavior" with a ``Box``, the largest L2 distance of two actions that count as the same;
+        each of their numbers spans -1..1
     :param warm_start: begin from the base encoder's weights, if it is the same network
     :param forward_reset_interval: updates between resets of the forward model, None for never
     """
@@ -253,7 +242,7 @@ class ActionBisimulation(Objective):
         """Indices of ``n_pairs`` pairs of different transitions (all, if there are fewer), each (n_pairs,)."""
         n = len(actions)
         if self.expectation == "behavior":
-            allowed = same_action_pairs(actions, self.action_radius)
+            allowed = self.actions.same(actions, self.action_radius)
         else:
             allowed = th.ones(n, n, dtype=th.bool, device=actions.device)
         # Distances are symmetric, and a state's distance to itself is zero on both sides and teaches nothing.
@@ -278,20 +267,12 @@ class ActionBisimulation(Objective):
         As in the paper, W_1 is the L1 distance of the means.
         """
         assert self.forward_model is not None
-        actions = self._expectation_actions(phi.device)
+        actions = self.actions.sample(self.n_action_samples, phi.device)
         total = th.zeros(len(i), device=phi.device)
         for action in actions:
             mean, _ = self.forward_model(phi, action.expand(len(phi), -1))
             total += l1_distance(mean[i], mean[j])
         return total / len(actions)
-
-    def _expectation_actions(self, device: th.device) -> th.Tensor:
-        """The actions to average over, as network inputs (n, action_dim)."""
-        if self.n_actions is not None:
-            return th.eye(self.n_actions, device=device)
-        assert isinstance(self.action_space, gym.spaces.Box)
-        low, high = (th.as_tensor(k, device=device) for k in (self.action_space.low, self.action_space.high))
-        return low + (high - low) * th.rand(self.n_action_samples, self.action_dim).to(device)
 
     @th.no_grad()
     def after_step(self) -> None:

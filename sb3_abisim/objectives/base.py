@@ -8,6 +8,7 @@ from torch import nn
 
 from sb3_abisim.common.transitions import TransitionBatch
 from sb3_abisim.networks.base import Encoder
+from sb3_abisim.objectives.actions import actions_of
 
 # Observations already through SB3's ``preprocess_obs``, on the objective's device.
 TensorBatch = TransitionBatch[th.Tensor]
@@ -19,7 +20,7 @@ class Objective(nn.Module):
     It knows of no optimizer, log or file. Whatever must survive an interruption is a parameter or a buffer.
 
     :param encoder: the network to pretrain
-    :param action_space: ``Discrete`` (starting at 0) or one-dimensional ``Box``
+    :param action_space: ``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or a bounded ``Box`` of floats
     :raises ValueError: for another action space
     """
 
@@ -29,10 +30,7 @@ class Objective(nn.Module):
 
     def __init__(self, encoder: Encoder, action_space: gym.Space[Any]) -> None:
         super().__init__()
-        discrete = isinstance(action_space, gym.spaces.Discrete) and action_space.start == 0
-        box = isinstance(action_space, gym.spaces.Box) and len(action_space.shape) == 1
-        if not (discrete or box):
-            raise ValueError(f"actions must be Discrete starting at 0 or a one-dimensional Box, got {action_space}")
+        self.actions = actions_of(action_space)
         self.encoder = encoder
         self.action_space = action_space
 
@@ -47,14 +45,9 @@ class Objective(nn.Module):
             raise ValueError(f"{cls.name} takes single steps, got k = {k}; set k to 1, or use acro or info_nce")
 
     @property
-    def n_actions(self) -> int | None:
-        """Number of discrete actions, None for continuous ones."""
-        return int(self.action_space.n) if isinstance(self.action_space, gym.spaces.Discrete) else None
-
-    @property
     def action_dim(self) -> int:
-        """Size of an action as a network input: one-hot for discrete actions."""
-        return self.n_actions or int(self.action_space.shape[0])  # type: ignore[index]
+        """Size of an action as a network input, see :mod:`sb3_abisim.objectives.actions`."""
+        return self.actions.input_dim
 
     def action_inputs(self, actions: th.Tensor) -> th.Tensor:
         """Actions as network inputs.
@@ -62,9 +55,7 @@ class Objective(nn.Module):
         :param actions: as in :class:`~sb3_abisim.common.transitions.TransitionBatch`
         :return: float32 (batch, action_dim), or (batch, k, action_dim)
         """
-        if self.n_actions is None:
-            return actions
-        return nn.functional.one_hot(actions, self.n_actions).float()
+        return self.actions.inputs(actions)
 
     @classmethod
     def base_network_kwargs(cls, network_kwargs: dict[str, Any]) -> dict[str, Any]:

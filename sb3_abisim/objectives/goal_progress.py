@@ -21,7 +21,8 @@ it is small. Progress is that change: the difference of the distances, by the ta
 that were seen. A blocked move shows the same observation twice, so its progress is exactly 0. A step counts the same
 near a goal and far from it.
 
-With continuous actions both heads are linear in the action, so that the greedy action is a corner of the box.
+Both heads are linear in the action's inputs, too (:mod:`sb3_abisim.objectives.actions`), so that the greedy action is
+known at once: with continuous actions it is a corner of the box.
 """
 
 import copy
@@ -29,12 +30,12 @@ import math
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch as th
 from stable_baselines3.common.utils import polyak_update
 from torch import nn
 
 from sb3_abisim.networks.base import Encoder
+from sb3_abisim.objectives.actions import Actions
 from sb3_abisim.objectives.base import Objective, TensorBatch
 from sb3_abisim.registry import register_method
 
@@ -87,37 +88,36 @@ def goal_progress_loss(
 
 
 class GoalHead(nn.Module):
-    """A linear layer from the embedding to a number for each goal and action.
+    """A linear layer from the embedding to a number for each goal and action, linear in the action's inputs, too.
 
     :param features_dim: size of the embedding
     :param n_goals: number of goals
-    :param n_actions: number of ``Discrete`` actions; None for continuous ones
-    :param action_dim: size of a continuous action
+    :param actions: of the environment
     """
 
-    def __init__(self, features_dim: int, n_goals: int, n_actions: int | None, action_dim: int) -> None:
+    def __init__(self, features_dim: int, n_goals: int, actions: Actions) -> None:
         super().__init__()
-        self.n_goals, self.n_actions = n_goals, n_actions
-        self.n_terms = 1 + action_dim if n_actions is None else n_actions
-        self.linear = nn.Linear(features_dim, n_goals * self.n_terms)
+        self.n_goals, self.actions = n_goals, actions
+        self.linear = nn.Linear(features_dim, n_goals * (1 + actions.input_dim))
 
-    def forward(self, phi: th.Tensor) -> th.Tensor:
-        """Factors of the action's terms: one for each action, or a constant and one for each dimension.
+    def forward(self, phi: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """What the number is without the action, and the coefficients of the action's inputs.
 
         :param phi: (batch, features_dim)
-        :return: (batch, n_goals, n_terms)
+        :return: (batch, n_goals) and (batch, n_goals, input_dim)
         """
-        factors: th.Tensor = self.linear(phi).view(len(phi), self.n_goals, self.n_terms)
-        return factors
+        outputs: th.Tensor = self.linear(phi).view(len(phi), self.n_goals, -1)
+        return outputs[..., 0], outputs[..., 1:]
 
-    def of_action(self, phi: th.Tensor, terms: th.Tensor) -> th.Tensor:
+    def of_action(self, phi: th.Tensor, inputs: th.Tensor) -> th.Tensor:
         """The numbers of the action taken.
 
         :param phi: (batch, features_dim)
-        :param terms: of the action, (batch, n_terms)
+        :param inputs: of the action, (batch, input_dim)
         :return: (batch, n_goals)
         """
-        numbers: th.Tensor = (self(phi) * terms[:, None]).sum(dim=2)
+        constant, coefficients = self(phi)
+        numbers: th.Tensor = constant + (coefficients * inputs[:, None]).sum(dim=2)
         return numbers
 
     def greedy(self, phi: th.Tensor) -> th.Tensor:
@@ -126,17 +126,16 @@ class GoalHead(nn.Module):
         :param phi: (batch, features_dim)
         :return: (batch, n_goals)
         """
-        factors: th.Tensor = self(phi)
-        if self.n_actions is not None:
-            return factors.amax(dim=2)
-        return factors[..., 0] + factors[..., 1:].abs().sum(dim=2)
+        constant, coefficients = self(phi)
+        numbers: th.Tensor = constant + self.actions.greatest(coefficients)
+        return numbers
 
 
 class GoalProgress(Objective):
     """Embed the values of random goals, and what each action does to them.
 
     :param encoder: the network to pretrain; both heads are linear on its embedding, which should be wide
-    :param action_space: ``Discrete`` or one-dimensional ``Box``
+    :param action_space: of the environment
     :param base_encoder: any trained encoder; frozen here, it says which states are in a goal
     :param n_goals: states of the data that are goals
     :param goal_share: share of all states that are in a goal
@@ -187,8 +186,8 @@ class GoalProgress(Objective):
                 )
             encoder.load_state_dict(own | shared)
         self.base_encoder = copy.deepcopy(base_encoder).requires_grad_(False)
-        self.value_head = GoalHead(encoder.features_dim, n_goals, self.n_actions, self.action_dim)
-        self.progress_head = GoalHead(encoder.features_dim, n_goals, self.n_actions, self.action_dim)
+        self.value_head = GoalHead(encoder.features_dim, n_goals, self.actions)
+        self.progress_head = GoalHead(encoder.features_dim, n_goals, self.actions)
         self.target_encoder = copy.deepcopy(encoder).requires_grad_(False)
         self.target_head = copy.deepcopy(self.value_head).requires_grad_(False)
         # Of the goals' states; nan until `prepare` has chosen them.
@@ -220,21 +219,6 @@ class GoalProgress(Objective):
         """
         return th.cdist(psi, self.goals, p=1.0) <= self.radii
 
-    def action_terms(self, actions: th.Tensor) -> th.Tensor:
-        """What the heads' factors are multiplied by: one-hot, or 1 and the action scaled to -1..1.
-
-        :param actions: as in a batch
-        :return: (batch, n_terms)
-        """
-        inputs = self.action_inputs(actions)
-        if self.n_actions is not None:
-            return inputs
-        assert isinstance(self.action_space, gym.spaces.Box)
-        bounds = (self.action_space.low, self.action_space.high)
-        low, high = (th.as_tensor(np.asarray(bound), device=inputs.device) for bound in bounds)
-        scaled = 2.0 * (inputs - low) / (high - low) - 1.0
-        return th.cat([th.ones_like(scaled[:, :1]), scaled], dim=1)
-
     @th.no_grad()
     def values(self, batch: TensorBatch) -> tuple[th.Tensor, th.Tensor]:
         """V(s, g) and V(s', g) of the target network, 1 for a state that is in the goal.
@@ -254,9 +238,9 @@ class GoalProgress(Objective):
         values, next_values = self.values(batch)
         q_target = value_targets(next_values, self.gamma)
         progress_target = progress_targets(values, next_values, self.gamma)
-        terms = self.action_terms(batch.actions)
+        inputs = self.action_inputs(batch.actions)
         phi = self.encoder(batch.obs)
-        q, progress = self.value_head.of_action(phi, terms), self.progress_head.of_action(phi, terms)
+        q, progress = self.value_head.of_action(phi, inputs), self.progress_head.of_action(phi, inputs)
         loss, named = goal_progress_loss(
             q, q_target, progress, progress_target, self.value_weight, self.progress_weight
         )

@@ -15,8 +15,8 @@ push each transition away from its action. So the loss here is the negative loga
 The pair is written [psi(s), psi(s') - psi(s)], not [psi(s), psi(s')]: an embedded action can be near to the change
 that it makes, but not near to all states that it was taken in. In a trial with the plain pair, Nav2D stayed at chance.
 
-With discrete actions and k = 1 the negatives are all other actions. Otherwise they are the actions, or sequences of k
-actions, of the batch's other transitions, unless they equal the positive.
+With ``Discrete`` actions and k = 1 the negatives are all other actions. Otherwise they are the actions, or sequences
+of k actions, of the batch's other transitions, unless they equal the positive.
 """
 
 import math
@@ -56,7 +56,7 @@ class InfoNCE(Objective):
     """Embed what a transition and its action have in common.
 
     :param encoder: the network to pretrain
-    :param action_space: ``Discrete`` or one-dimensional ``Box``
+    :param action_space: as for :class:`~sb3_abisim.objectives.base.Objective`
     :param k: steps of a transition, whose k actions are the positive
     :param l1_penalty: weight of the L1 norm of both embeddings, as in :mod:`sb3_abisim.objectives.ssi`
     """
@@ -86,18 +86,19 @@ class InfoNCE(Objective):
 
         :param batch_size: of the batches
         """
-        return 1.0 / (batch_size if self.n_actions is None else min(batch_size, self.n_actions**self.k))
+        return 1.0 / min(batch_size, self.actions.count**self.k)
 
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """InfoNCE; terms ``info_nce``, ``l1_norm`` and ``accuracy`` (share of actions found among the candidates).
 
-        :param batch: transitions with ``actions`` of shape (batch, k) or (batch, k, action_dim)
+        :param batch: transitions with ``actions`` of shape (batch, k, *shape of an action)
         """
         psi, psi_next = batch.split_pair(self.encoder(batch.frames))
         pairs = th.cat([psi, psi_next - psi], dim=1)
-        if self.n_actions is not None and self.k == 1:
-            candidates = self.action_encoder(th.eye(self.n_actions, device=pairs.device))
-            loss, terms = info_nce_loss(pairs, candidates, batch.actions[:, 0])
+        every = self.actions.enumerate(pairs.device) if self.k == 1 else None
+        if every is not None:
+            positives = self.actions.index(batch.actions[:, 0])
+            loss, terms = info_nce_loss(pairs, self.action_encoder(every), positives)
         else:
             sequences = self.action_inputs(batch.actions).flatten(start_dim=1)
             same = (sequences[:, None] == sequences[None]).all(dim=2)

@@ -11,8 +11,9 @@ beta_max, alpha       ``l1_penalty``, ``accuracy``             adaptive regulari
 
 Choices: losses are means over the batch where the paper writes sums over the dataset. The paper's table ends the
 inverse model in a layer of 256 (Nav2D) or 32 (Pointmass) units, which is no distribution over actions. Here it ends in
-one logit per action, or mean and log standard deviation per continuous action dimension. The accuracy alpha of a
-continuous prediction is its coefficient of determination, clipped to 0..1.
+one logit per action, or mean and log standard deviation per continuous action dimension; in an action of several
+components, each component has its own (:mod:`sb3_abisim.objectives.actions`). The accuracy alpha is the share of
+actions with all components right, for continuous actions the coefficient of determination, clipped to 0..1.
 """
 
 import math
@@ -20,7 +21,6 @@ from typing import Any
 
 import gymnasium as gym
 import torch as th
-from torch import nn
 
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.heads import MLP
@@ -29,7 +29,6 @@ from sb3_abisim.registry import register_method
 
 ADAPTIVE_FORMS = ("paper", "released", "chance_corrected")
 HIDDEN_DIM = 256
-_LOG_STD_RANGE = (-5.0, 2.0)
 
 
 def inverse_dynamics_loss(
@@ -71,7 +70,7 @@ class InverseDynamics(Objective):
     """Embed what is needed to predict which action led from s_t to s_{t+k}, and as little else as possible.
 
     :param encoder: the network to pretrain
-    :param action_space: ``Discrete`` or one-dimensional ``Box``
+    :param action_space: as for :class:`~sb3_abisim.objectives.base.Objective`
     :param l1_penalty: beta, or beta_max with ``adaptive``
     :param adaptive: None for a fixed beta, else "paper", "released" or "chance_corrected" (see :func:`adaptive_beta`)
     :param delta_scale: how much more the inverse model's input shows of the change than of the state:
@@ -99,8 +98,7 @@ class InverseDynamics(Objective):
         self.l1_penalty = l1_penalty
         self.adaptive = adaptive
         self.delta_scale = delta_scale
-        n_outputs = self.n_actions or 2 * self.action_dim
-        self.inverse_model = MLP(2 * encoder.features_dim, HIDDEN_DIM, n_outputs)
+        self.inverse_model = MLP(2 * encoder.features_dim, HIDDEN_DIM, self.actions.n_outputs)
         # Accuracy of the previous iteration; a buffer, so that an interrupted run goes on with the same beta.
         self.accuracy: th.Tensor
         self.register_buffer("accuracy", th.zeros(()))
@@ -112,7 +110,7 @@ class InverseDynamics(Objective):
         """
         psi, psi_next = batch.split_pair(self.encoder(batch.frames))
         inputs = th.cat([psi / self.delta_scale, self.delta_scale * (psi_next - psi)], dim=1)
-        log_prob, accuracy = self._score(self.inverse_model(inputs), batch.actions)
+        log_prob, accuracy = self.actions.score(self.inverse_model(inputs), batch.actions)
         beta = th.as_tensor(self.l1_penalty)
         if self.adaptive is not None:
             beta = adaptive_beta(self.l1_penalty, self.accuracy, self.adaptive, self.chance_accuracy(len(psi)))
@@ -122,22 +120,11 @@ class InverseDynamics(Objective):
         return loss, {**{k: v.detach() for k, v in terms.items()}, "beta": beta, "accuracy": accuracy}
 
     def chance_accuracy(self, batch_size: int) -> float:
-        """One in the number of actions; 0 for continuous ones, whose accuracy is a coefficient of determination.
+        """One in the number of actions; 0 for a ``Box``, whose accuracy is a coefficient of determination.
 
         :param batch_size: makes no difference
         """
-        return 0.0 if self.n_actions is None else 1.0 / self.n_actions
-
-    def _score(self, outputs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Log-likelihood of each action (batch,), and the share of correct predictions (or clipped R^2)."""
-        if self.n_actions is not None:
-            log_prob = -nn.functional.cross_entropy(outputs, actions, reduction="none")
-            return log_prob, (outputs.argmax(dim=1) == actions).float().mean()
-        mean, log_std = outputs.chunk(2, dim=1)
-        log_std = log_std.clamp(*_LOG_STD_RANGE)
-        log_prob = th.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=1)  # type: ignore[no-untyped-call]
-        unexplained = (mean - actions).pow(2).sum() / (actions - actions.mean(dim=0)).pow(2).sum()
-        return log_prob, (1.0 - unexplained).clamp(0.0, 1.0).detach()
+        return self.actions.chance
 
 
 register_method("ssi", InverseDynamics, label="single-step inverse dynamics", extractor="SSIExtractor", color="#009E73")

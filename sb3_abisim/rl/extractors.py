@@ -87,6 +87,9 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
         return features
 
     def _check_input(self, observations: th.Tensor) -> None:
+        # Numbers are not known then.
+        if th.compiler.is_exporting():
+            return
         largest = float(observations.max()) if observations.numel() else 0.0
         if largest > 1.0:
             raise ValueError(
@@ -183,6 +186,8 @@ class PretrainedExtractor(BaseEncoderExtractor):
         self.metadata = None if file is None else file.metadata
         self._absence = absence
         hash = bytes(32) if file is None else bytes.fromhex(file.hash)
+        # The same as a number of Python, which is known during torch.export, too.
+        self._has_weights = file is not None
         self.register_buffer("weights_ready", th.tensor(file is not None, dtype=th.uint8))
         self.register_buffer("encoder_hash", th.tensor(list(hash), dtype=th.uint8))
         if freeze:
@@ -199,7 +204,7 @@ class PretrainedExtractor(BaseEncoderExtractor):
 
         :raises EncoderNotFoundError: (a ``FileNotFoundError``) listing the places searched
         """
-        if not bool(self.weights_ready):
+        if not self._has_weights:
             raise EncoderNotFoundError(f"{self._absence}. The extractor has no pretrained weights")
 
     def apply(self, fn: Any) -> "PretrainedExtractor":
@@ -250,6 +255,7 @@ class PretrainedExtractor(BaseEncoderExtractor):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         # The loaded model may be one that never had its weights.
         self._input_checked = False
+        self._has_weights = bool(self.weights_ready)
 
 
 class EncoderExtractor(PretrainedExtractor):

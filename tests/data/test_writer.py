@@ -94,7 +94,7 @@ def test_continuous_actions_keep_their_bounds(tmp_path: Path) -> None:
         ({"source": None}, "source must say where the data comes from"),
         ({"source": Path("x")}, "must be what JSON can hold"),
         ({"observation_space": gym.spaces.Box(-1, 1, (3,))}, "uint8 images"),
-        ({"action_space": gym.spaces.MultiBinary(3)}, "Discrete or a float32 Box"),
+        ({"action_space": gym.spaces.Text(3)}, "MultiBinary or a Box of floats"),
     ],
     ids=str,
 )

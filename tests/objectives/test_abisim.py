@@ -9,7 +9,7 @@ import torch as th
 from objective_inputs import LineEncoder, change_weights
 from torch import nn
 
-from sb3_abisim.objectives.abisim import ActionBisimulation, action_bisim_target, same_action_pairs
+from sb3_abisim.objectives.abisim import ActionBisimulation, action_bisim_target
 from sb3_abisim.objectives.base import TensorBatch
 
 DISCRETE = gym.spaces.Discrete(2)
@@ -135,12 +135,6 @@ def test_loss_of_nearest_pairs_of_a_collapsed_base_is_finite():
     for parameter in objective.base_encoder.parameters():
         parameter.zero_()
     assert th.isfinite(objective.loss(make_batch())[0])
-
-
-def test_same_action_pairs_of_continuous_actions():
-    actions = th.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 0.5]])
-    expected = [[True, True, False], [True, True, False], [False, False, True]]
-    assert same_action_pairs(actions, 0.2).tolist() == expected
 
 
 @pytest.mark.parametrize("expectation", ["uniform", "behavior"])

@@ -11,6 +11,7 @@ from objective_inputs import CONTINUOUS, LineEncoder, change_weights
 from torch import nn
 
 from sb3_abisim.networks.base import Encoder, make_encoder
+from sb3_abisim.objectives.actions import actions_of
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.objectives.goal_progress import (
     HORIZON,
@@ -73,7 +74,7 @@ def test_the_loss_equals_a_loop(action_space: gym.Space) -> None:
                 distance = (objective.base_encoder(obs)[0] - objective.goals[g]).abs().sum()
                 factors = objective.target_head.linear(objective.target_encoder(obs))[0].view(5, -1)[g]
                 if isinstance(action_space, gym.spaces.Discrete):
-                    best = max(factors.tolist())
+                    best = float(factors[0]) + max(factors[1:].tolist())
                 else:
                     corners = itertools.product((-1, 1), repeat=2)
                     best = max(float(factors[0] + factors[1] * x + factors[2] * y) for x, y in corners)
@@ -83,7 +84,7 @@ def test_the_loss_equals_a_loop(action_space: gym.Space) -> None:
             progress = (math.log(max(next_value, least)) - math.log(max(value, least))) / -math.log(0.9)
             progress = min(1.0, max(-1.0, progress))
             phi, action = objective.encoder(batch.obs[i : i + 1]), batch.actions[i]
-            terms_of = nn.functional.one_hot(action, 3).float() if action.dim() == 0 else th.cat([th.ones(1), action])
+            terms_of = th.cat([th.ones(1), nn.functional.one_hot(action, 3).float() if action.dim() == 0 else action])
             for head, target in ((objective.value_head, 0.9 * next_value), (objective.progress_head, progress)):
                 error = float((head.linear(phi)[0].view(5, -1)[g] * terms_of).sum()) - target
                 total_value += error**2 * (head is objective.value_head)
@@ -199,7 +200,7 @@ def test_values_converge_to_gamma_to_the_distance_and_progress_to_the_exact_one(
     with th.no_grad():
         values, _ = objective.values(batch)
         progress = objective.progress_head.of_action(
-            objective.encoder(batch.obs), objective.action_terms(batch.actions)
+            objective.encoder(batch.obs), objective.action_inputs(batch.actions)
         )
     assert np.allclose(values, GAMMA ** distance[states][:, goals], atol=0.02)
     exact = distance[states][:, goals] - distance[following][:, goals]
@@ -227,19 +228,28 @@ def test_without_the_progress_loss_the_progress_is_not_learned() -> None:
 # Networks.
 
 
-def test_the_greedy_continuous_action_is_a_corner() -> None:
-    head = GoalHead(4, 3, None, 2)
-    phi = th.rand(5, 4)
-    grid = th.cartesian_prod(th.linspace(-1, 1, 5), th.linspace(-1, 1, 5))
+@pytest.mark.parametrize(
+    "space",
+    [
+        gym.spaces.Discrete(4, start=2),
+        gym.spaces.MultiDiscrete([2, 3]),
+        gym.spaces.MultiBinary(3),
+        gym.spaces.Box(np.array([0.0, 10.0], np.float32), np.array([4.0, 30.0], np.float32)),
+    ],
+)
+def test_the_greedy_action_is_the_best_of_all(space: gym.Space) -> None:
+    actions = actions_of(space)
+    head, phi = GoalHead(4, 3, actions), th.rand(5, 4)
+    tried = {
+        "Discrete": [2, 3, 4, 5],
+        "MultiDiscrete": list(itertools.product(range(2), range(3))),
+        "MultiBinary": list(itertools.product(range(2), repeat=3)),
+        "Box": list(itertools.product(np.linspace(0, 4, 5), np.linspace(10, 30, 5))),
+    }[type(space).__name__]
+    dtype = th.float32 if isinstance(space, gym.spaces.Box) else th.int64
     with th.no_grad():
-        tried = th.stack([head.of_action(phi, th.cat([th.ones(1), a]).expand(5, 3)) for a in grid])
-        assert th.allclose(head.greedy(phi), tried.amax(dim=0), atol=1e-6)
-
-
-def test_continuous_actions_are_scaled_to_their_bounds() -> None:
-    space = gym.spaces.Box(np.array([0.0, 10.0], np.float32), np.array([4.0, 30.0], np.float32))
-    terms = make(space).action_terms(th.tensor([[0.0, 30.0], [2.0, 20.0]]))
-    assert terms.tolist() == [[1.0, -1.0, 1.0], [1.0, 0.0, 0.0]]
+        numbers = [head.of_action(phi, actions.inputs(th.tensor([one] * 5, dtype=dtype))) for one in tried]
+        assert th.allclose(head.greedy(phi), th.stack(numbers).amax(dim=0), atol=1e-5)
 
 
 def test_it_begins_with_the_layers_that_the_base_has() -> None:

@@ -2,7 +2,6 @@
 
 import math
 
-import gymnasium as gym
 import pytest
 import torch as th
 from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, make_batch
@@ -160,11 +159,6 @@ def test_adaptive_beta_follows_the_previous_accuracy():
 def test_refuses_bad_settings(kwargs):
     with pytest.raises(ValueError, match=str(next(iter(kwargs.values())))):
         InverseDynamics(LineEncoder(), DISCRETE, **kwargs)
-
-
-def test_refuses_other_action_spaces():
-    with pytest.raises(ValueError, match="MultiBinary"):
-        InverseDynamics(LineEncoder(), gym.spaces.MultiBinary(3))
 
 
 @pytest.mark.parametrize(("space", "chance"), [(DISCRETE, 1 / 3), (CONTINUOUS, 0.0)])

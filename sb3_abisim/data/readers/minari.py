@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_abisim.common.spaces import is_channels_first, space_from_json, space_to_json
+from sb3_abisim.common.spaces import fit_actions, is_channels_first, space_from_json, space_to_json
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import (
     CONTENT_HASH_KEY,
@@ -28,7 +28,7 @@ from sb3_abisim.data.format import (
     check_factor_layout,
     check_spaces,
 )
-from sb3_abisim.data.writer import Segment, check_folder, fit_actions, write_segments
+from sb3_abisim.data.writer import Segment, check_folder, write_segments
 from sb3_abisim.registry import register_reader
 
 # The key of our block in a Minari dataset's metadata.
@@ -98,7 +98,7 @@ def _check_id(dataset_id: str) -> None:
 def import_dataset(dataset_id: str, folder: str | Path) -> str:
     """Make a dataset folder from Minari's local store; rewards are dropped.
 
-    Observations must be uint8 images (channels first or last) and actions ``Discrete`` or a float32 ``Box``.
+    Observations must be uint8 images (channels first or last) and actions as ``collect`` takes them.
 
     :param dataset_id: of a dataset that is already in the local store
     :param folder: new or empty
