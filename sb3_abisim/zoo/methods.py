@@ -13,7 +13,7 @@ import yaml
 
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.extractors import network_arguments
 
@@ -99,6 +99,9 @@ class MethodSpec:
         if self.frozen:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
             replaced["vec_env_wrapper"] = [*_items(entry.get("vec_env_wrapper")), wrapper]
+            if entry.get("frame_stack") or "frame_stack" in given:
+                # The encoder's file says how it stacks, before it embeds.
+                replaced["frame_stack"] = None
         if self.frozen or "policy" not in given:
             replaced["policy"] = self._policy(str(entry.get("policy")))
         for name in sorted({"policy_kwargs", *replaced} & set(given)):
@@ -196,6 +199,27 @@ class MethodRecord:
 
 
 PREPROCESSING_KEYS = ("env_wrapper", "frame_stack", "normalize")
+
+
+def check_preprocessing(file: EncoderFile, settings: Mapping[str, Any], frozen: bool = False) -> None:
+    """Refuse hyperparameters that show an encoder something else than it was pretrained on.
+
+    :param file: of the encoder; one that records no preprocessing is left to the check of spaces
+    :param settings: a zoo entry's hyperparameters
+    :param frozen: whether the encoder stacks observations by itself
+    :raises ValueError: naming both sides
+    """
+    recorded = file.metadata["preprocessing"]
+    there = {"env_wrapper": _items(recorded.get("env_wrapper")), "frame_stack": recorded.get("frame_stack", 1)}
+    here = {"env_wrapper": _items(settings.get("env_wrapper")), "frame_stack": settings.get("frame_stack") or 1}
+    names = ["env_wrapper"] if frozen else ["env_wrapper", "frame_stack"]
+    different = [name for name in names if there[name] != here[name]]
+    if recorded and different:
+        sides = "; ".join(f"{name}: {there[name]} in pretraining, {here[name]} now" for name in different)
+        raise ValueError(
+            f"{file.path} was pretrained on other observations ({sides}); give the same with -params or --conf-file, "
+            "or collect and pretrain again"
+        )
 
 
 def hyperparameters_file(algo: str, env_id: str) -> Path | None:
