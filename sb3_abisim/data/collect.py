@@ -411,11 +411,12 @@ def _resolve_wrapper(env_wrapper: Any) -> Wrapper:
     from rl_zoo3.utils import get_wrapper_class  # type: ignore[import-untyped, unused-ignore]
 
     try:
-        wrapper: Wrapper = get_wrapper_class({"env_wrapper": env_wrapper})
+        wrapper = get_wrapper_class({"env_wrapper": env_wrapper})
     except (ImportError, AttributeError, AssertionError, TypeError, ValueError) as error:
         raise ValueError(
             f"env_wrapper {env_wrapper!r} cannot be imported ({error}); give dotted paths of wrappers as in a zoo YAML"
         ) from error
+    assert wrapper is not None
     return wrapper
 
 
@@ -549,7 +550,7 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None) -> 
     )  # fmt: skip
     parser.add_argument(
         "--env-wrapper", nargs="+", action="extend", default=[], metavar="CLASS",
-        help="wrappers of the environment, as in a zoo YAML: gymnasium.wrappers.GrayscaleObservation (default: the zoo's for ID)",
+        help="dotted paths of wrappers, such as gymnasium.wrappers.GrayscaleObservation (default: the zoo's for ID)",
     )  # fmt: skip
     parser.add_argument(
         "--frame-stack", type=int, metavar="N", help="observations shown together (default: the zoo's for ID, else 1)"

@@ -4,6 +4,7 @@ What else an observation holds comes beside the images, as the ``factors()`` of 
 :class:`~sb3_abisim.envs.base.BatchEnv` do. Copies may live in worker processes; what they show is the same.
 """
 
+import contextlib
 import itertools
 import multiprocessing
 import pickle
@@ -68,7 +69,7 @@ class ImageLayout:
             for key, part in space.spaces.items():
                 if key != image_key and isinstance(part, spaces.Box | spaces.Discrete | spaces.MultiBinary):
                     name = re.sub(r"\W|^(?=\d)", "_", key)
-                    factors[name], layouts[name] = key, (np.dtype(part.dtype), tuple(part.shape))
+                    factors[name], layouts[name] = key, (np.dtype(part.dtype), tuple(part.shape or ()))
             space = space.spaces[image_key]
         elif image_key is not None:
             raise ValueError(f"image_key {image_key!r} chooses from a Dict of observations, got {space}; leave it out")
@@ -80,11 +81,11 @@ class ImageLayout:
             )
         shape = space.shape
         assert shape is not None
+        stored: tuple[int, ...] = shape
+        channels = FIRST
         if len(shape) == 2:
             channels, stored = NONE, (1, *shape)
-        elif is_channels_first(shape):
-            channels, stored = FIRST, shape
-        else:
+        elif not is_channels_first(shape):
             channels, stored = LAST, (shape[2], *shape[:2])
         return cls(spaces.Box(0, 255, stored, np.uint8), channels, image_key, factors, layouts)
 
@@ -256,6 +257,9 @@ class WorkerCopies(EnvCopies):
     def close(self, **kwargs: Any) -> None:
         """End the workers."""
         for pipe in self._pipes:
+            # Workers hold ends of each other's pipes where they were forked: closing ours does not end them.
+            with contextlib.suppress(OSError):
+                pipe.send(None)
             pipe.close()
         for process in self._processes:
             process.join(timeout=10)
@@ -264,17 +268,18 @@ class WorkerCopies(EnvCopies):
 
 
 def _work(pipe: Connection, data: bytes) -> None:
-    """A worker: answers until the pipe is closed or the parent is interrupted."""
+    """A worker: answers until it gets None, the parent dies or somebody interrupts both."""
     try:
         # What cloudpickle writes, pickle reads.
         copies = EnvCopies(*pickle.loads(data))
         content_hash = getattr(copies.envs[0].unwrapped, "content_hash", None)
         pipe.send(((copies.layout, copies.single_action_space, content_hash), None))
-        while True:
-            name, kwargs = pipe.recv()
+        while (asked := pipe.recv()) is not None:
+            name, kwargs = asked
             outcome = getattr(copies, name)(**kwargs)
             pipe.send(((outcome, copies.factors()), None))
     except (EOFError, BrokenPipeError, ConnectionResetError, KeyboardInterrupt):
         pass
     except Exception as error:
+        # The parent raises it.
         pipe.send((traceback.format_exc(), error))

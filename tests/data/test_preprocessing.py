@@ -123,7 +123,7 @@ def test_a_wrapper_is_applied_and_recorded(tmp_path: Path) -> None:
     dataset, dark = frames_of(tmp_path / "dark", "last", env_wrapper=DARKEN)
     np.testing.assert_array_equal(dark, plain // 2)
     assert dataset.preprocessing == {"channels": "last", "env_wrapper": [DARKEN]}
-    with pytest.raises(ValueError, match="begun with other arguments .*preprocessing"):
+    with pytest.raises(ValueError, match=r"begun with other arguments .*preprocessing"):
         frames_of(tmp_path / "dark", "last")
     with pytest.raises(ValueError, match=r"env_wrapper \['no.such.Wrapper'\] cannot be imported"):
         frames_of(tmp_path / "d", "last", env_wrapper="no.such.Wrapper")
@@ -140,7 +140,7 @@ def test_a_wrapper_is_applied_and_recorded(tmp_path: Path) -> None:
     ids=str,
 )
 def test_what_is_no_image_is_refused_with_the_remedy(space: gym.Space[Any]) -> None:
-    with pytest.raises(ValueError, match="uint8 images .*AddRenderObservation"):
+    with pytest.raises(ValueError, match=r"uint8 images .*AddRenderObservation"):
         ImageLayout.of(space)
 
 
@@ -188,7 +188,8 @@ def test_from_channels_last_to_an_agent(tmp_path: Path, frame_stack: int) -> Non
     # Frozen: the wrapper stacks single observations, and gives what the encoder gives of SB3's stacks.
     frozen = VecEncodeObservations(DummyVecEnv([lambda: gym.make("Forms-v0")]), str(path), device="cpu")
     venv = VecFrameStack(DummyVecEnv([lambda: gym.make("Forms-v0")]), frame_stack)
-    venv.seed(3), frozen.seed(3)
+    venv.seed(3)
+    frozen.seed(3)
     shown, embedded = venv.reset(), frozen.reset()
     for _ in range(12):
         expected_embedding = frozen.encode(np.moveaxis(shown, -1, 1).copy())
