@@ -397,6 +397,12 @@ def make_vector_env(
             return gym.make_vec(env_id, n_envs or N_BATCHED, "vector_entry_point", **env_kwargs)
         make_fns = [make_fn] * (n_envs or N_COPIES)
         return EnvCopies(make_fns, image_key) if n_workers == 1 else WorkerCopies(make_fns, image_key, n_workers)
+    except ValueError as error:
+        if wrapper is None or preprocessing is None:
+            raise
+        raise ValueError(
+            f"{error} (this is with env_wrapper {preprocessing.env_wrapper}; --env-wrapper takes the place of the zoo's)"
+        ) from error
     except (TypeError, OSError, gym.error.Error) as error:
         raise ValueError(f"cannot make {env_id} with {env_kwargs}: {error}") from error
 

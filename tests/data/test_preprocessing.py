@@ -125,6 +125,8 @@ def test_a_wrapper_is_applied_and_recorded(tmp_path: Path) -> None:
     assert dataset.preprocessing == {"channels": "last", "env_wrapper": [DARKEN]}
     with pytest.raises(ValueError, match=r"begun with other arguments .*preprocessing"):
         frames_of(tmp_path / "dark", "last")
+    with pytest.raises(ValueError, match=r"uint8 images .*with env_wrapper .*--env-wrapper takes the place"):
+        frames_of(tmp_path / "d", "last", env_wrapper="gymnasium.wrappers.FlattenObservation")
     with pytest.raises(ValueError, match=r"env_wrapper \['no.such.Wrapper'\] cannot be imported"):
         frames_of(tmp_path / "d", "last", env_wrapper="no.such.Wrapper")
 
