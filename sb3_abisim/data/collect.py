@@ -1,4 +1,4 @@
-"""Collect random-action transitions into a dataset: ``sb3-abisim collect --env ID -n N -o DIR``.
+"""Collect transitions into a dataset: ``sb3-abisim collect --env ID -n N -o DIR``.
 
 Shards follow each other in chains. Chain c follows from ``SeedSequence(seed, spawn_key=(c,))`` alone: at its start
 environments are made anew and reset, and within it episodes run on from shard to shard. A shard that is not there is
@@ -63,6 +63,25 @@ Wrapper = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 
 
 @dataclass(frozen=True)
+class Policy:
+    """What chooses actions instead of chance.
+
+    :param act_fn: from observations, uint8 (n_envs, C, H, W), stacked where the dataset is, to actions (n_envs, ...);
+        the same observations must give the same actions
+    :param name: recorded with the dataset; it should say which weights there are
+    :param epsilon: probability of a uniformly random action in its place
+    """
+
+    act_fn: Callable[[NDArray[np.uint8]], NDArray[Any]]
+    name: str
+    epsilon: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.epsilon <= 1:
+            raise ValueError(f"epsilon must be in 0..1, got {self.epsilon}")
+
+
+@dataclass(frozen=True)
 class Preprocessing:
     """What stands between an environment and its image observations.
 
@@ -89,10 +108,11 @@ def collect(
     env_wrapper: Any = None,
     frame_stack: int = 1,
     image_key: str | None = None,
+    policy: Policy | None = None,
     n_workers: int = 1,
     progress: bool = False,
 ) -> str:
-    """Collect transitions under uniformly random actions; go on where an earlier call was stopped.
+    """Collect transitions; go on where an earlier call was stopped.
 
     :param env_id: a registered id, or a function that makes one environment
     :param n_transitions: size of the dataset, at least 1; a larger one than before extends it
@@ -105,6 +125,7 @@ def collect(
     :param frame_stack: observations that readers of the dataset show together, as ``VecFrameStack`` does; each is
         stored once
     :param image_key: which key of a ``Dict`` of observations holds the image; None for the only one that does
+    :param policy: chooses the actions; None for uniformly random ones
     :param n_workers: processes that step the environments, unless these run as one batch; the bytes do not depend on it
     :param progress: show a progress bar on stderr
     :return: the dataset's hash
@@ -136,7 +157,7 @@ def collect(
     if n_envs is None:
         n_envs = there.get("n_envs")
     make_fn = functools.partial(make_vector_env, env_id, n_envs, env_kwargs, preprocessing, n_workers)
-    source = _Source(make_fn, env_id, env_kwargs, seed, there, preprocessing)
+    source = _Source(make_fn, env_id, env_kwargs, seed, there, preprocessing, policy)
     try:
         return _collect(source, n_transitions, folder, progress)
     finally:
@@ -160,6 +181,7 @@ class _Source:
     :param seed: see :func:`collect`
     :param there: what the folder was begun with, empty for a new one
     :param preprocessing: see :class:`Preprocessing`
+    :param policy: see :func:`collect`
     """
 
     def __init__(
@@ -170,7 +192,9 @@ class _Source:
         seed: int,
         there: dict[str, Any],
         preprocessing: Preprocessing,
+        policy: Policy | None,
     ) -> None:
+        self._policy, self._frame_stack = policy, preprocessing.frame_stack
         self._make_fn, self._seed = make_fn, seed
         self.env = env = make_fn()
         observation_space, action_space = env.single_observation_space, env.single_action_space
@@ -205,7 +229,7 @@ class _Source:
             "action_space": space_to_json(action_space),
             "factors": describe_factors(_factors(env)),
             CONTENT_HASH_KEY: _content_hash(env),
-            "policy": "uniform",
+            "policy": "uniform" if policy is None else f"{policy.name}, epsilon {policy.epsilon:g}",
             "seed": seed,
             "n_envs": env.num_envs,
             "steps_per_shard": self.steps,
@@ -231,7 +255,8 @@ class _Source:
                 # A reset does not undo all that wrappers and simulators remember.
                 self.env.close()
                 self.env = self._make_fn()
-            self._rollout = _Rollout(self.env, np.random.SeedSequence(self._seed, spawn_key=(chain,)))
+            chain_seed = np.random.SeedSequence(self._seed, spawn_key=(chain,))
+            self._rollout = _Rollout(self.env, chain_seed, self._policy, self._frame_stack)
             self._next = first
         per_shard = self.steps * self.env.num_envs
         while self._next < k:
@@ -305,25 +330,56 @@ class _Rollout:
 
     :param env: see :func:`collect_shard`
     :param seed: see :func:`collect_shard`
+    :param policy: see :func:`collect`
+    :param frame_stack: observations that the policy sees together
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], seed: np.random.SeedSequence) -> None:
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        seed: np.random.SeedSequence,
+        policy: Policy | None = None,
+        frame_stack: int = 1,
+    ) -> None:
         reset_seed, action_seed = seed.spawn(2)
         self._env, self._generator = env, np.random.default_rng(action_seed)
         self._observation, _ = env.reset(seed=reset_seed.generate_state(env.num_envs).tolist())
+        self._policy = policy
+        # Oldest first, zeros before an episode's first observation.
+        self._stack = np.zeros((env.num_envs, frame_stack, *self._observation.shape[1:]), np.uint8)
+        self._stack[:, -1] = self._observation
+
+    def _choose(self, actions: NDArray[Any], by_policy: NDArray[np.bool_]) -> None:
+        """Put the policy's actions in place of some random ones."""
+        if self._policy is not None and by_policy.any():
+            n_envs, _, _, *size = self._stack.shape
+            chosen = np.asarray(self._policy.act_fn(self._stack.reshape(n_envs, -1, *size)))
+            actions[by_policy] = chosen.reshape(actions.shape)[by_policy]
+
+    def _push(self, done: NDArray[np.bool_]) -> None:
+        """Move on to the observations after a step."""
+        self._stack = np.roll(self._stack, -1, axis=1)
+        self._stack[done] = 0
+        self._stack[:, -1] = self._observation
 
     def advance(self, n_steps: int, n_transitions: int, advanced: Callable[[int], object]) -> list[Segment]:
         """The next ``n_steps`` of every copy as segments, copy after copy; see :func:`collect_shard`."""
         env, n_envs = self._env, self._env.num_envs
         kept = n_transitions // n_envs + (np.arange(n_envs) < n_transitions % n_envs)
         actions = _random_actions(env.single_action_space, (n_steps, n_envs), self._generator)
+        by_policy = np.zeros((n_steps, n_envs), bool)
+        if self._policy is not None:
+            by_policy = self._generator.random((n_steps, n_envs)) >= self._policy.epsilon
         # Frames that can be rendered again are not kept.
         rendered = _renders_factors(env)
         observations, factors = [] if rendered else [self._observation], [_factors(env)]
         # Per copy: (steps taken at the episode's end, how it ended, last frame, last factors).
         endings: list[list[_Ending]] = [[] for _ in range(n_envs)]
         for t in range(kept.max()):
+            self._choose(actions[t], by_policy[t])
             self._observation, _, terminated, truncated, infos = env.step(actions[t])
+            if self._policy is not None:
+                self._push(terminated | truncated)
             if not rendered:
                 observations.append(self._observation)
             factors.append(_factors(env))
@@ -401,7 +457,7 @@ def make_vector_env(
         if wrapper is None or preprocessing is None:
             raise
         raise ValueError(
-            f"{error} (this is with env_wrapper {preprocessing.env_wrapper}; --env-wrapper takes the place of the zoo's)"
+            f"{error} (with env_wrapper {preprocessing.env_wrapper}; --env-wrapper takes the place of the zoo's)"
         ) from error
     except (TypeError, OSError, gym.error.Error) as error:
         raise ValueError(f"cannot make {env_id} with {env_kwargs}: {error}") from error
@@ -523,14 +579,16 @@ def _random_actions(space: gym.Space[Any], shape: tuple[int, int], generator: np
 
 
 EntryFn = Callable[[str, str | None], dict[str, Any]]
+PolicyFn = Callable[[str, float], Policy]
 
 
-def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None) -> None:
+def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, policy_fn: PolicyFn | None = None) -> None:
     """The command; see ``--help``.
 
     :param argv: its arguments; None for those of the process
     :param entry_fn: from an id and ``--conf-file`` to ``env_wrapper``, ``frame_stack`` and ``env_kwargs``, which flags
         override; None for nothing
+    :param policy_fn: from ``--policy`` and ``--epsilon`` to a policy; None where there is none but chance
     """
     parser = make_parser(
         "collect",
@@ -568,13 +626,25 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None) -> 
     parser.add_argument(
         "--image-key", metavar="KEY", help="which of a Dict of observations is the image (default: the only one)"
     )
-    parser.set_defaults(entry_fn=entry_fn)
+    if policy_fn is not None:
+        parser.add_argument(
+            "--policy", default="random", metavar="RUN",
+            help="who acts: random, a run's folder (its final model) or a model's .zip in one (default: %(default)s)",
+        )  # fmt: skip
+        parser.add_argument(
+            "--epsilon", type=float, default=0.0,
+            help="probability of a random action in place of the policy's (default: %(default)s)",
+        )  # fmt: skip
+    parser.set_defaults(entry_fn=entry_fn, policy_fn=policy_fn)
     run(parser, argv, _command, "stopped; finished shards are kept, the same command goes on from there")
 
 
 def _command(args: argparse.Namespace) -> None:
     entry = {} if args.entry_fn is None else args.entry_fn(args.env, args.conf_file)
     env_kwargs = {**(entry.get("env_kwargs") or {}), **parse_pairs(args.env_kwargs, "--env-kwargs")}
+    policy = None
+    if args.policy_fn is not None and args.policy != "random":
+        policy = args.policy_fn(args.policy, args.epsilon)
     try:
         collect(
             args.env,
@@ -586,6 +656,7 @@ def _command(args: argparse.Namespace) -> None:
             env_wrapper=[parse_value(text) for text in args.env_wrapper] or entry.get("env_wrapper"),
             frame_stack=entry.get("frame_stack", 1) if args.frame_stack is None else args.frame_stack,
             image_key=args.image_key,
+            policy=policy,
             n_workers=args.n_workers,
             progress=True,
         )

@@ -1,17 +1,24 @@
-"""``sb3-abisim collect`` with what the zoo puts between an environment and the algorithm.
+"""For ``sb3-abisim collect``: what the zoo puts between an environment and the algorithm.
 
 The zoo's YAML entry of an id (this package's, else rl-zoo3's own, or that of ``--conf-file``) gives ``env_wrapper``,
-``frame_stack`` and ``env_kwargs``, so that an encoder is pretrained on what ``sb3-abisim train`` shows it.
+``frame_stack`` and ``env_kwargs``, so that an encoder is pretrained on what ``sb3-abisim train`` shows it. With
+``--policy`` the model of a run acts.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_abisim.data import collect
-from sb3_abisim.envs import ENV_IDS
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.common.files import file_hash
+from sb3_abisim.data.collect import Policy
+from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.registry import get_traits
+from sb3_abisim.rl.merge import merge_encoder
+from sb3_abisim.rl.vec_encode import EncodedBox
 from sb3_abisim.zoo.methods import PREPROCESSING_KEYS, hyperparameters_entry, normalizes_observations, read_entries
+from sb3_abisim.zoo.runs import read_run
 
 
 def preprocessing_entry(env_id: str, conf_file: str | None = None) -> dict[str, Any]:
@@ -27,9 +34,6 @@ def preprocessing_entry(env_id: str, conf_file: str | None = None) -> dict[str, 
         if env_id not in entries:
             raise ValueError(f"--conf-file {conf_file} has no entry {env_id}, only {', '.join(entries) or 'none'}")
         entry = entries[env_id]
-    elif env_id in ENV_IDS:
-        # Their arguments of collection are those of the command line.
-        return {}
     else:
         entry = hyperparameters_entry(get_traits(env_id).algo, env_id)
     # rl-zoo3's default entries normalize vectors; what shows images has no use for it, and says so at training.
@@ -42,9 +46,36 @@ def preprocessing_entry(env_id: str, conf_file: str | None = None) -> dict[str, 
     return {key: entry[key] for key in sorted(keys) if entry.get(key)}
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """The command; see ``--help``.
+def model_policy(name: str, epsilon: float) -> Policy:
+    """A trained model's deterministic actions.
 
-    :param argv: its arguments; None for those of the process
+    :param name: folder of a zoo run, whose final model acts, or a model's ``.zip`` in it; models are unpickled, so they
+        must be your own
+    :param epsilon: see :class:`~sb3_abisim.data.collect.Policy`
+    :raises ValueError: if it is none, or was trained on something else than observations
     """
-    collect.main(argv, preprocessing_entry)
+    from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]
+
+    path = Path(name)
+    run = read_run(path if path.is_dir() else path.parent)
+    if normalizes_observations(run.settings.get("normalize")):
+        raise ValueError(f"{run.folder} was trained on normalized observations, which are not collected")
+    path = run.folder / f"{run.env_name}.zip" if path.is_dir() else path
+    if not path.is_file():
+        raise ValueError(f"--policy: there is no model {path}; give a run's folder, or a .zip in it")
+    model = ALGOS[run.algo].load(path, device="cpu")
+    if isinstance(model.observation_space, EncodedBox):
+        # Trained on embeddings.
+        model = merge_encoder(model, str(run.folder / run.env_name / RUN_COPY))
+    space = model.observation_space
+
+    def act(observations: NDArray[np.uint8]) -> NDArray[Any]:
+        if observations.shape[1:] != space.shape:
+            raise ValueError(
+                f"{path} takes observations {space.shape}, and the dataset's are {observations.shape[1:]}; give its "
+                "environment, --env-wrapper and --frame-stack"
+            )
+        actions: NDArray[Any] = model.predict(observations, deterministic=True)[0]
+        return actions
+
+    return Policy(act, f"{run.algo} {file_hash(path)[:16]}", epsilon)

@@ -99,8 +99,8 @@ class MethodSpec:
         if self.frozen:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
             replaced["vec_env_wrapper"] = [*_items(entry.get("vec_env_wrapper")), wrapper]
-            if entry.get("frame_stack") or "frame_stack" in given:
-                # The encoder's file says how it stacks, before it embeds.
+            if entry.get("frame_stack") and "frame_stack" not in given and _stacks(self._encoder(encoder)):
+                # The wrapper stacks observations; rl-zoo3 would stack embeddings once more.
                 replaced["frame_stack"] = None
         if self.frozen or "policy" not in given:
             replaced["policy"] = self._policy(str(entry.get("policy")))
@@ -334,6 +334,14 @@ def _network_arguments(encoder: str) -> dict[str, Any]:
     except EncoderNotFoundError:
         # Whoever needs the file says so; a saved model that is continued is complete without it.
         return {}
+
+
+def _stacks(encoder: str) -> bool:
+    """Whether an encoder was pretrained on stacks of observations."""
+    try:
+        return bool(load_encoder(encoder).metadata["preprocessing"].get("frame_stack", 1) > 1)
+    except EncoderNotFoundError:
+        return False  # whoever needs the file says so
 
 
 def normalizes_observations(normalize: Any) -> bool:

@@ -13,7 +13,7 @@ from dataset_inputs import rewrite_meta, tree
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecTransposeImage
 
 from sb3_abisim.data import collect as collect_module
-from sb3_abisim.data.collect import collect
+from sb3_abisim.data.collect import Policy, collect
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, INSIDE, META_NAME, DatasetError
 
@@ -221,3 +221,31 @@ def test_a_function_makes_the_environment(tmp_path: Path) -> None:
     dataset = TransitionDataset(tmp_path / "d")
     assert dataset.env_id == f"{__name__}:LongEnv" and dataset.n_transitions == 60
     assert set(itertools.chain(dataset.ends.tolist())) >= {INSIDE, CUT}
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.5, 1.0])
+def test_a_policy_sees_the_stacks_of_the_dataset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, epsilon: float
+) -> None:
+    monkeypatch.setattr(index_env, "SHAPE", (3, 10, 11))
+
+    def act(observations: np.ndarray) -> np.ndarray:
+        """The two newest step numbers, of stacks of three."""
+        return np.stack([observations[:, 3, 0, 0] / 100, 3 + observations[:, 6, 0, 0] / 100], 1).astype(np.float32)
+
+    policy = Policy(act, "steps", epsilon)
+    for name in ("direct", "grown"):
+        dataset = collect_long(tmp_path / name, 40 if name == "grown" else 150, frame_stack=3, policy=policy)
+    collect_long(tmp_path / "grown", frame_stack=3, policy=policy)
+    assert tree(tmp_path / "grown") == tree(tmp_path / "direct")
+    dataset = TransitionDataset(tmp_path / "direct")
+    assert dataset.meta["policy"] == f"steps, epsilon {epsilon:g}"
+    starts = dataset.valid_starts()
+    same = np.isclose(dataset.actions(starts), act(dataset.frames(starts))).all(axis=1)
+    assert abs(same.mean() - (1 - epsilon)) < 0.15
+    assert epsilon or same.all()
+
+
+def test_a_probability_is_one() -> None:
+    with pytest.raises(ValueError, match=r"epsilon must be in 0..1, got 2"):
+        Policy(lambda observations: observations, "x", 2)

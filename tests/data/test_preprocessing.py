@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_abisim.__main__ import main
 from sb3_abisim.data.collect import collect
 from sb3_abisim.data.copies import ImageLayout
 from sb3_abisim.data.dataset import TransitionDataset
@@ -18,7 +19,7 @@ from sb3_abisim.data.format import CONFIG_NAME
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.pretrain import pretrain
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
-from sb3_abisim.zoo.collect import main, preprocessing_entry
+from sb3_abisim.zoo.collect import preprocessing_entry
 
 HEIGHT, WIDTH = 64, 64
 
@@ -147,12 +148,12 @@ def test_what_is_no_image_is_refused_with_the_remedy(space: gym.Space[Any]) -> N
 
 
 def test_the_zoo_entry_of_an_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert preprocessing_entry("PointMaze-v0") == preprocessing_entry("Forms-v0") == {}
+    assert preprocessing_entry("Forms-v0") == {}
     mine = tmp_path / "mine.yml"
     mine.write_text(
         f"Forms-v0:\n  env_wrapper: {DARKEN}\n  frame_stack: 2\n  env_kwargs: {{form: last}}\n  n_envs: 3\n"
     )
-    words = ["--env", "Forms-v0", "-n", "40", "--n-envs", "2", "--conf-file", str(mine), "-o"]
+    words = ["collect", "--env", "Forms-v0", "-n", "40", "--n-envs", "2", "--conf-file", str(mine), "-o"]
     main([*words, str(tmp_path / "d")])
     dataset = TransitionDataset(tmp_path / "d")
     assert dataset.preprocessing == {"channels": "last", "env_wrapper": [DARKEN], "frame_stack": 2}
