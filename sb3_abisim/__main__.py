@@ -4,13 +4,14 @@ import difflib
 import importlib
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from sb3_abisim._version import __version__
 from sb3_abisim.common.cli import PROGRAM
 
 # Command: the module whose ``main`` runs it, and what it does.
 COMMANDS = {
-    "collect": ("sb3_abisim.data.collect", "collect random-action transitions of an environment into a dataset"),
+    "collect": ("sb3_abisim.data.collect", "collect transitions of an environment into a dataset"),
     "data": ("sb3_abisim.data.command", "import a dataset from another format, or export one to Minari"),
     "pretrain": ("sb3_abisim.pretraining.pretrain", "pretrain an encoder on a dataset"),
     "train": ("sb3_abisim.zoo.command", "train an agent: rl-zoo3's train with our methods for --conf-file"),
@@ -43,6 +44,23 @@ def usage() -> str:
     )
 
 
+def _preprocessing_entry(env_id: str, conf_file: str | None) -> dict[str, Any]:
+    """See :mod:`sb3_abisim.zoo.collect`; ids of this package need no rl-zoo3, which takes seconds to import."""
+    from sb3_abisim.envs import ENV_IDS
+
+    if conf_file is None and env_id in ENV_IDS:
+        return {}
+    from sb3_abisim.zoo.collect import preprocessing_entry
+
+    return preprocessing_entry(env_id, conf_file)
+
+
+def _model_policy(name: str, epsilon: float) -> Any:
+    from sb3_abisim.zoo.collect import model_policy
+
+    return model_policy(name, epsilon)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Run a command; exits with 2 for an unknown one.
 
@@ -61,6 +79,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"{PROGRAM}: error: unknown command {words[0]!r}; {hint}", file=sys.stderr)
         sys.exit(2)
     module = importlib.import_module(COMMANDS[words[0]][0])
+    if words[0] == "collect":
+        module.main(words[1:], _preprocessing_entry, _model_policy)
+        return
     # rl-zoo3's commands share a module, which needs the name.
     module.main(words if module.__name__.startswith("sb3_abisim.zoo.command") else words[1:])
 

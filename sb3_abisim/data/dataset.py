@@ -29,6 +29,7 @@ from sb3_abisim.data.format import (
     array_file,
     array_layout,
     check_meta,
+    continued_segments,
     from_json_file,
     holds_frames,
 )
@@ -55,8 +56,11 @@ class TransitionDataset:
 
     A frame index counts the frames of all shards, in order. Pickling (for worker processes) sends the path only.
 
+    With ``frame_stack`` n in its preprocessing, an observation is a stack: the n frames up to the index, oldest first,
+    and zeros in place of those before an episode's first, as from Stable-Baselines3's ``VecFrameStack``.
+
     :param path: the folder
-    :param eval_fraction: share of the segments (episodes and cut episodes) that make up ``split="eval"``, in [0, 1)
+    :param eval_fraction: share of the episodes (whole ones and cut ones) that make up ``split="eval"``, in [0, 1)
     :param verify: True compares every file with its sha256, False only sizes; None does so once per process for
         datasets below ``VERIFY_BELOW_BYTES``
     :raises DatasetError: if the folder is not a finished dataset, or is damaged, or has no frames and the scenes that
@@ -74,7 +78,15 @@ class TransitionDataset:
         self.env_kwargs = current_env_kwargs(self.meta["env_kwargs"])
         self.n_transitions: int = self.meta["n_transitions"]
         self.n_frames: int = self.meta["n_frames"]
-        self.observation_space: spaces.Box = space_from_json(self.meta["observation_space"])  # type: ignore[assignment]
+        self.preprocessing: dict[str, Any] = self.meta.get("preprocessing", {})
+        self.frame_stack: int = self.preprocessing.get("frame_stack", 1)
+        self._frame_shape = tuple(self.meta["observation_space"]["shape"])
+        self.observation_space: spaces.Box = space_from_json(  # type: ignore[assignment]
+            {
+                **self.meta["observation_space"],
+                "shape": [self.frame_stack * self._frame_shape[0], *self._frame_shape[1:]],
+            }
+        )
         self.action_space = space_from_json(self.meta["action_space"])
         self._check_files(verify)
         self._render_fn: Callable[[dict[str, NDArray[Any]]], NDArray[np.uint8]] | None = None
@@ -94,6 +106,7 @@ class TransitionDataset:
         self._last = np.flatnonzero(self._ends != INSIDE)  # the last frame of each segment
         self._check_ends()
         self._remaining = self._make_remaining()
+        self._before = self._make_before()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.eval_fraction, False)
@@ -147,10 +160,10 @@ class TransitionDataset:
         return np.concatenate(starts), np.repeat(steps, [len(found) for found in starts])
 
     def frames(self, index: Any) -> NDArray[np.uint8]:
-        """Frames at the given indices.
+        """Frames at the given indices, in stacks where the dataset says so.
 
         :param index: integers [m] in 0..n_frames - 1
-        :return: uint8 [m, C, H, W], a copy
+        :return: uint8 [m, C, H, W], a copy; C counts the channels of all frames of a stack
         :raises IndexError: for an index out of range
         """
         return self._frames(self._check_index(index))
@@ -261,7 +274,30 @@ class TransitionDataset:
         return array.astype(np.int64)
 
     def _frames(self, index: NDArray[np.int64]) -> NDArray[np.uint8]:
-        return self._gather("frames", index) if self._render_fn is None else self._render_fn(self._factors(index))
+        if self._render_fn is not None:
+            return self._render_fn(self._factors(index))
+        if self.frame_stack == 1:
+            return self._gather("frames", index)
+        members = self._stack_members(index)
+        there = members >= 0
+        # Stacks of steps that follow each other share frames: each is read once.
+        read, places = np.unique(members[there], return_inverse=True)
+        out = np.zeros((*members.shape, *self._frame_shape), np.uint8)
+        out[there] = self._gather("frames", read)[places]
+        return out.reshape(len(index), *self.observation_space.shape)
+
+    def _stack_members(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The frames of stacks, oldest first, [m, frame_stack]; -1 for what is before an episode's first."""
+        members = np.full((len(index), self.frame_stack), -1, np.int64)
+        members[:, -1] = frame = index.copy()
+        for column in range(self.frame_stack - 2, -1, -1):
+            starts = np.flatnonzero((frame > 0) & (self._ends[frame - 1] != INSIDE) | (frame == 0))
+            # The first frame of a segment that goes on with another is that one's last.
+            before = self._before[np.searchsorted(self._last, frame[starts])]
+            frame = np.maximum(frame - 1, -1)
+            frame[starts] = np.where(before >= 0, self._last[before] - 1, -1)
+            members[:, column] = frame
+        return members
 
     def _factors(self, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
@@ -316,13 +352,23 @@ class TransitionDataset:
         lengths = np.diff(self._last, prepend=-1)
         return (np.repeat(self._last, lengths) - np.arange(self.n_frames)).astype(np.int32)
 
+    def _make_before(self) -> NDArray[np.int64]:
+        """Per segment, the one whose episode it goes on with in the next shard; -1 where it begins one."""
+        before = continued_segments(self.meta, np.diff(self._last, prepend=-1) - 1)
+        cut = self._ends[self._last] == CUT
+        return np.where((before >= 0) & cut[before], before, -1)
+
     def _in_eval(self) -> NDArray[np.bool_]:
-        """Per frame, whether its segment belongs to the split "eval"."""
-        n_segments = len(self._last)
-        n_eval = min(n_segments - 1, max(1, round(self.eval_fraction * n_segments))) if self.eval_fraction else 0
-        chosen = np.zeros(n_segments, dtype=bool)
-        chosen[np.random.Generator(np.random.PCG64(_SPLIT_SEED)).permutation(n_segments)[:n_eval]] = True
-        return np.repeat(chosen, np.diff(self._last, prepend=-1))
+        """Per frame, whether its episode belongs to the split "eval"."""
+        begins = self._before < 0
+        episode = np.empty(len(begins), np.int64)
+        episode[begins] = np.arange(n_episodes := int(begins.sum()))
+        for segment in np.flatnonzero(~begins):
+            episode[segment] = episode[self._before[segment]]
+        n_eval = min(n_episodes - 1, max(1, round(self.eval_fraction * n_episodes))) if self.eval_fraction else 0
+        chosen = np.zeros(n_episodes, dtype=bool)
+        chosen[np.random.Generator(np.random.PCG64(_SPLIT_SEED)).permutation(n_episodes)[:n_eval]] = True
+        return np.repeat(chosen[episode], np.diff(self._last, prepend=-1))
 
     def _check_files(self, verify: bool | None) -> None:
         entries = {name: entry for shard in self.meta["shards"] for name, entry in shard["files"].items()}
@@ -373,5 +419,7 @@ def _repair(path: Path, meta: dict[str, Any]) -> str:
     return (
         "run the command that collected it again, which collects damaged shards anew: sb3-abisim collect "
         f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} "
-        f"-o {path.absolute()}" + ("" if not meta["env_kwargs"] else " with its --env-kwargs")
+        f"-o {path.absolute()}"
+        + ("" if not meta["env_kwargs"] else " with its --env-kwargs")
+        + ("" if not meta.get("preprocessing") else f" and its preprocessing, {meta['preprocessing']}")
     )

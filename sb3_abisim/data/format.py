@@ -11,6 +11,11 @@
 In the format of version 2 there are no frames. They are rendered from the factors when they are read, by the
 environment that env_id and env_kwargs name, whose content hash must be the same. All else is as in version 1.
 
+In version 3 episodes run on from shard to shard, within chains of ``shards_per_chain`` shards; where a copy of the
+environment goes on follows from the numbers (:func:`continued_segments`). ``preprocessing`` says what stood between the
+environment and its frames: ``channels`` ("last" or "none" where they were put first), ``env_wrapper``, ``image_key``,
+and ``frame_stack``, which is left to readers: frames are stored once.
+
 A segment is an episode, or the part of one that a shard's end cuts off. All documents are free of times and host names,
 so that the same command writes the same bytes.
 """
@@ -31,6 +36,8 @@ from sb3_abisim.common.spaces import action_layout, check_action_space, is_chann
 FORMAT_VERSION = 1
 # Without frames, for environments that can render them from the factors.
 RENDERED_FORMAT_VERSION = 2
+# With chains of shards, and preprocessing.
+CHAINED_FORMAT_VERSION = 3
 # Keys of meta.json: hashes of the dataset, of the document, and (also in config.json) of the environment's content.
 HASH_KEY, DOCUMENT_HASH_KEY, CONTENT_HASH_KEY = "digest", "checksum", "fingerprint"
 CONFIG_NAME = "config.json"
@@ -52,12 +59,23 @@ IDENTITY_KEYS = (
     "steps_per_shard",
     "source",
 )
+# Those that a dataset of CHAINED_FORMAT_VERSION has beside them.
+_CHAINED_KEYS = ("shards_per_chain", "preprocessing")
 _FACTOR_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _SHARD_FILE = re.compile(r"(frames|actions|ends|factor_[A-Za-z_][A-Za-z0-9_]*)-\d{5,}\.npy|shard-\d{5,}\.json")
 
 
 class DatasetError(ValueError):
     """A folder is not a finished, undamaged dataset; the message says what is wrong and what to do."""
+
+
+def identity_keys(document: dict[str, Any]) -> tuple[str, ...]:
+    """The keys of config.json that a dataset's hash covers.
+
+    :param document: config.json or meta.json
+    """
+    chained = document.get("format_version") == CHAINED_FORMAT_VERSION
+    return IDENTITY_KEYS + _CHAINED_KEYS if chained else IDENTITY_KEYS
 
 
 def array_names(identity: dict[str, Any]) -> tuple[str, ...]:
@@ -74,7 +92,7 @@ def holds_frames(identity: dict[str, Any]) -> bool:
 
     :param identity: as for :func:`array_names`
     """
-    return bool(identity["format_version"] == FORMAT_VERSION)
+    return bool(identity["format_version"] != RENDERED_FORMAT_VERSION)
 
 
 def array_file(name: str, shard: int) -> str:
@@ -210,7 +228,7 @@ def make_meta(config: dict[str, Any], shards: list[dict[str, Any]]) -> dict[str,
     :param shards: the shards' manifests, in order
     """
     hashed = {
-        "identity": {key: config[key] for key in IDENTITY_KEYS},
+        "identity": {key: config[key] for key in identity_keys(config)},
         "files": [{name: entry["sha256"] for name, entry in shard["files"].items()} for shard in shards],
     }
     meta = config | {
@@ -229,17 +247,55 @@ def check_meta(meta: dict[str, Any]) -> None:
     :param meta: the content of meta.json
     :raises ValueError: with the reason
     """
-    known = FORMAT_VERSION, RENDERED_FORMAT_VERSION
+    known = FORMAT_VERSION, RENDERED_FORMAT_VERSION, CHAINED_FORMAT_VERSION
     if meta.get("format_version") not in known:
         raise ValueError(f"format version {meta.get('format_version')!r}, this version reads {known}")
-    if set(meta) != {*IDENTITY_KEYS, "versions", "n_transitions", "n_frames", "shards", HASH_KEY, DOCUMENT_HASH_KEY}:
+    keys = identity_keys(meta)
+    if set(meta) != {*keys, "versions", "n_transitions", "n_frames", "shards", HASH_KEY, DOCUMENT_HASH_KEY}:
         raise ValueError("its keys are not those of a dataset")
     check_factor_layout(meta["factors"])
-    config = {key: meta[key] for key in (*IDENTITY_KEYS, "versions")}
+    config = {key: meta[key] for key in (*keys, "versions")}
+    if meta["format_version"] == CHAINED_FORMAT_VERSION:
+        _check_chained(meta)
     if not all(is_shard_manifest(shard, k, meta) for k, shard in enumerate(meta["shards"])):
         raise ValueError("its list of shards is not one")
     if make_meta(config, meta["shards"]) != meta:
         raise ValueError("its hash does not match")
+
+
+def _check_chained(meta: dict[str, Any]) -> None:
+    numbers = [meta[key] for key in ("shards_per_chain", "steps_per_shard", "n_envs")]
+    stack = meta["preprocessing"].get("frame_stack", 1)
+    if not all(type(number) is int and number >= 1 for number in (*numbers, stack)):
+        raise ValueError(f"its numbers of chains {numbers} or stacks {stack!r} are none")
+
+
+def continued_segments(meta: dict[str, Any], lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which segment of the shard before each segment goes on with: the same copy's last one, or -1 for none.
+
+    :param meta: the content of meta.json
+    :param lengths: transitions of each segment, in order
+    :return: number of a segment, or -1; whether that one was CUT is left to the caller
+    :raises DatasetError: if copies do not begin where segments do
+    """
+    before = np.full(len(lengths), -1, np.int64)
+    if meta["format_version"] != CHAINED_FORMAT_VERSION:
+        return before
+    begins = np.concatenate([[0], np.cumsum(lengths)])
+    total, last_of_copy = 0, np.empty(0, np.int64)
+    for k, shard in enumerate(meta["shards"]):
+        n, n_envs = shard["n_transitions"], meta["n_envs"]
+        kept = n // n_envs + (np.arange(n_envs) < n % n_envs)
+        wanted = total + np.concatenate([[0], np.cumsum(kept)])
+        edges = np.searchsorted(begins, wanted)
+        if not np.array_equal(begins[np.minimum(edges, len(lengths))], wanted):
+            raise DatasetError(f"the episode ends of shard {k} contradict the numbers in meta.json; damaged or forged")
+        first, last = edges[:-1], edges[1:] - 1
+        if k % meta["shards_per_chain"]:
+            here = kept > 0
+            before[first[here]] = last_of_copy[here]
+        total, last_of_copy = total + n, last
+    return before
 
 
 def _sha256(document: dict[str, Any]) -> str:

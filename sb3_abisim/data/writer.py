@@ -26,7 +26,6 @@ from sb3_abisim.data.format import (
     CUT,
     FORMAT_VERSION,
     HASH_KEY,
-    IDENTITY_KEYS,
     META_NAME,
     TERMINATED,
     TRUNCATED,
@@ -37,6 +36,7 @@ from sb3_abisim.data.format import (
     check_spaces,
     describe_factors,
     from_json_file,
+    identity_keys,
     is_shard_file,
     is_shard_manifest,
     make_meta,
@@ -200,7 +200,7 @@ def open_writer(folder: Path, identity: dict[str, Any]) -> Iterator["DatasetWrit
 
     :param folder: the dataset's folder, made if absent; a caller that computes before writing calls
         :func:`check_folder` first
-    :param identity: the keys ``IDENTITY_KEYS``, in JSON types
+    :param identity: the keys :func:`~sb3_abisim.data.format.identity_keys`, in JSON types
     :raises ValueError: if the folder is something else or was begun with another identity, or is being written
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -219,17 +219,17 @@ class DatasetWriter:
     def __init__(self, folder: Path, identity: dict[str, Any]) -> None:
         self.folder = folder
         remove_temporaries(folder)
-        self._config = {key: identity[key] for key in IDENTITY_KEYS} | {"versions": package_versions()}
+        self._config = {key: identity[key] for key in identity_keys(identity)} | {"versions": package_versions()}
         path = folder / CONFIG_NAME
         if path.exists():
             try:
                 there = from_json_file(path)
-                if set(there) != set(self._config):
+                if set(there) != {*identity_keys(there), "versions"}:
                     raise DatasetError(f"{path} is damaged (its keys are not those of a dataset)")
             except DatasetError as error:
                 raise DatasetError(f"{error}; remove {folder} and collect it again") from None
             named = {**there, "env_kwargs": current_env_kwargs(there["env_kwargs"])}
-            _require_same(folder, named, self._config, IDENTITY_KEYS)
+            _require_same(folder, named, self._config, identity_keys(self._config))
             self._versions_here, self._config = self._config["versions"], there
         else:
             self._versions_here = self._config["versions"]
@@ -285,6 +285,15 @@ class DatasetWriter:
             files[path.name] = {"bytes": path.stat().st_size, "sha256": file_hash(path)}
         manifest = {"n_transitions": n_transitions, "n_frames": n_frames, "files": files}
         self._write(shard_file(shard), to_json_bytes(manifest))
+
+    def count_ends(self, n_shards: int) -> NDArray[np.int64]:
+        """How often each value stands in the ends of finished shards.
+
+        :param n_shards: of shards 0 to ``n_shards - 1``
+        :return: by value, int64 (4,)
+        """
+        ends = (np.load(self.folder / array_file("ends", k), allow_pickle=False) for k in range(n_shards))
+        return sum((np.bincount(array, minlength=CUT + 1) for array in ends), np.zeros(CUT + 1, np.int64))
 
     def finish(self, n_shards: int) -> str:
         """Write meta.json over shards 0 to ``n_shards - 1``.

@@ -60,6 +60,7 @@ _METADATA_KEYS = {
     _DATASET_HASH_KEY,
     "versions",
 }
+_PREPROCESSING_KEY = "preprocessing"
 _HASH_BYTES = 32
 _REMEDY = "copy it again from where it came from, or write it again with sb3-abisim pretrain"
 
@@ -79,7 +80,8 @@ class EncoderFile:
     :param path: where it was read
     :param hash: sha256 in hexadecimal of its content
     :param encoder: the network with its weights, on the CPU, in evaluation mode
-    :param metadata: observation_space, action_space, env_id, env_kwargs, objective, settings, dataset_hash, versions
+    :param metadata: observation_space, action_space, env_id, env_kwargs, objective, settings, dataset_hash, versions,
+        preprocessing
     """
 
     path: Path
@@ -117,6 +119,7 @@ def save_encoder(
     settings: dict[str, Any],
     dataset_hash: str,
     reference_observations: NDArray[np.uint8],
+    preprocessing: dict[str, Any] | None = None,
 ) -> str:
     """Write an encoder file; the same arguments and package versions give the same bytes.
 
@@ -130,6 +133,7 @@ def save_encoder(
     :param settings: hyperparameters of the pretraining, JSON types
     :param dataset_hash: hash of the dataset
     :param reference_observations: a few observations, uint8 (n, channels, height, width)
+    :param preprocessing: what stood between the environment and these observations, as in a dataset's meta.json
     :return: hash of the content, sha256 in hexadecimal
     :raises ValueError: for weights that are not finite, values that JSON cannot hold, observations that do not fit
     """
@@ -153,6 +157,8 @@ def save_encoder(
             "settings": settings,
             _DATASET_HASH_KEY: dataset_hash,
             "versions": _versions(),
+            # Left out where there is none, as in files of before.
+            **({_PREPROCESSING_KEY: preprocessing} if preprocessing else {}),
         },
     }
     try:
@@ -199,7 +205,7 @@ def load_encoder(name: str | os.PathLike[str], network: str | None = None) -> En
             )
         tensors = safetensors.torch.load(data)
         metadata = document[_METADATA_KEY]
-        if set(metadata) != _METADATA_KEYS:
+        if set(metadata) - {_PREPROCESSING_KEY} != _METADATA_KEYS:
             raise ValueError(f"the metadata have the keys {sorted(metadata)}, expected {sorted(_METADATA_KEYS)}")
         reference, expected = (tensors.pop(key) for key in _REFERENCE_KEYS)
         if reference.dtype != th.uint8 or list(reference.shape[1:]) != metadata["observation_space"]["shape"]:
@@ -213,6 +219,7 @@ def load_encoder(name: str | os.PathLike[str], network: str | None = None) -> En
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:
         raise EncoderFileError(f"{path} is not a valid encoder file ({error!r}); {_REMEDY}") from error
     _check_reference(path, embed(encoder, space, reference), expected)
+    metadata.setdefault(_PREPROCESSING_KEY, {})
     metadata["dataset_hash"] = metadata.pop(_DATASET_HASH_KEY)
     metadata["settings"] = current_settings(metadata["settings"])
     metadata["env_kwargs"] = current_env_kwargs(metadata["env_kwargs"])

@@ -146,6 +146,7 @@ def warn_at_chance(
         warnings.warn(
             f"{output}: {name} ended at {accuracy:.3g}, no better than guessing ({chance:.3g}), so the encoder has "
             "learned nothing of its objective; try more updates, another seed, a smaller l1_penalty or, for ssi and "
-            "acro, a delta_scale above 1",
+            "acro, a delta_scale above 1. Where one frame does not show what an action does, as with velocities, "
+            "collect with --frame-stack 4",
             stacklevel=2,
         )

@@ -212,6 +212,7 @@ class PretrainRun:
             settings=self.settings,
             dataset_hash=dataset.hash,
             reference_observations=self._some_frames(N_REFERENCE),
+            preprocessing=dataset.preprocessing,
         )
         self.clean_up()
         warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval())

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.utils import get_device
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecTransposeImage
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_abisim.networks.base import Encoder
@@ -51,7 +51,7 @@ class VecEncodeObservations(VecEnvWrapper):
               encoder: Nav2D-v0/abisim
 
     :param venv: gives uint8 images in 0..255, as the encoder saw in pretraining; channels last are put first, as
-        Stable-Baselines3 does for features extractors
+        Stable-Baselines3 does for features extractors. Single observations are stacked for an encoder of stacks
     :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
         ``hf://owner/repository/file.safetensors``
     :param objective: refuse an encoder that another objective has trained; None takes any
@@ -71,6 +71,10 @@ class VecEncodeObservations(VecEnvWrapper):
         file = load_encoder(encoder)
         if objective is not None:
             check_objective(file, objective)
+        n_stack = file.metadata["preprocessing"].get("frame_stack", 1)
+        if n_stack > 1 and _n_channels(venv) * n_stack == file.metadata["observation_space"]["shape"][0]:
+            # rl-zoo3 would stack what comes out here; the encoder needs stacks of what goes in.
+            venv = VecFrameStack(venv, n_stack, "first")
         file.check(venv.observation_space)
         super().__init__(venv, observation_space=EncodedBox(file.encoder.features_dim, file.hash))
         self.encoder_file = file
@@ -117,3 +121,8 @@ class VecEncodeObservations(VecEnvWrapper):
         for info, embedding in zip(ended, embeddings[self.num_envs :], strict=True):
             info["terminal_observation"] = embedding
         return embeddings[: self.num_envs], rewards, dones, infos
+
+
+def _n_channels(venv: VecEnv) -> int:
+    shape = venv.observation_space.shape
+    return 0 if shape is None or len(shape) != 3 else int(shape[0])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_abisim.common.files import write_atomic
-from sb3_abisim.networks.encoder_file import RUN_COPY
+from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.merge import merge_encoder
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
@@ -88,7 +88,13 @@ def final_model(run: Run) -> BaseAlgorithm:
     model: BaseAlgorithm = ALGOS[run.algo].load(path, device="cpu")
     if isinstance(model.observation_space, EncodedBox):
         # Trained on embeddings, and the environments here give observations.
-        model = merge_encoder(model, str(run.folder / run.env_name / RUN_COPY))
+        copy = run.folder / run.env_name / RUN_COPY
+        if copy.is_file() and load_encoder(copy).metadata["preprocessing"].get("frame_stack", 1) > 1:
+            raise ValueError(
+                f"{run.folder} was trained on a frozen encoder of stacked observations, which are not stacked here; "
+                "look at it with sb3-abisim enjoy"
+            )
+        model = merge_encoder(model, str(copy))
     return model
 
 

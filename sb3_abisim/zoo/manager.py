@@ -41,6 +41,7 @@ from sb3_abisim.zoo.methods import (
     PREPROCESSING_KEYS,
     MethodRecord,
     MethodSpec,
+    check_preprocessing,
     encoding_kwargs,
     hyperparameters_entry,
     hyperparameters_file,
@@ -155,6 +156,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         encoding = encoding_kwargs(self._used)
         if encoding is not None:
             file = load_encoder(encoding["encoder"])
+            check_preprocessing(file, self._used, frozen=True)
             return MethodRecord(file.metadata["objective"], True, str(encoding["encoder"]), file.hash, preprocessing)
         extractor = self._policy_kwargs.get("features_extractor_class")
         if not (isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor)):
@@ -164,6 +166,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         if encoder is not None:
             try:
                 file = load_encoder(encoder, kwargs.get("network"))
+                check_preprocessing(file, self._used)
                 hash, method = file.hash, method or str(file.metadata["objective"])
             except EncoderNotFoundError:
                 # A saved model is complete without it.

@@ -13,7 +13,7 @@ import yaml
 
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.extractors import network_arguments
 
@@ -99,6 +99,9 @@ class MethodSpec:
         if self.frozen:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
             replaced["vec_env_wrapper"] = [*_items(entry.get("vec_env_wrapper")), wrapper]
+            if entry.get("frame_stack") and "frame_stack" not in given and _stacks(self._encoder(encoder)):
+                # The wrapper stacks observations; rl-zoo3 would stack embeddings once more.
+                replaced["frame_stack"] = None
         if self.frozen or "policy" not in given:
             replaced["policy"] = self._policy(str(entry.get("policy")))
         for name in sorted({"policy_kwargs", *replaced} & set(given)):
@@ -196,6 +199,27 @@ class MethodRecord:
 
 
 PREPROCESSING_KEYS = ("env_wrapper", "frame_stack", "normalize")
+
+
+def check_preprocessing(file: EncoderFile, settings: Mapping[str, Any], frozen: bool = False) -> None:
+    """Refuse hyperparameters that show an encoder something else than it was pretrained on.
+
+    :param file: of the encoder; one that records no preprocessing is left to the check of spaces
+    :param settings: a zoo entry's hyperparameters
+    :param frozen: whether the encoder stacks observations by itself
+    :raises ValueError: naming both sides
+    """
+    recorded = file.metadata["preprocessing"]
+    there = {"env_wrapper": _items(recorded.get("env_wrapper")), "frame_stack": recorded.get("frame_stack", 1)}
+    here = {"env_wrapper": _items(settings.get("env_wrapper")), "frame_stack": settings.get("frame_stack") or 1}
+    names = ["env_wrapper"] if frozen else ["env_wrapper", "frame_stack"]
+    different = [name for name in names if there[name] != here[name]]
+    if recorded and different:
+        sides = "; ".join(f"{name}: {there[name]} in pretraining, {here[name]} now" for name in different)
+        raise ValueError(
+            f"{file.path} was pretrained on other observations ({sides}); give the same with -params or --conf-file, "
+            "or collect and pretrain again"
+        )
 
 
 def hyperparameters_file(algo: str, env_id: str) -> Path | None:
@@ -310,6 +334,14 @@ def _network_arguments(encoder: str) -> dict[str, Any]:
     except EncoderNotFoundError:
         # Whoever needs the file says so; a saved model that is continued is complete without it.
         return {}
+
+
+def _stacks(encoder: str) -> bool:
+    """Whether an encoder was pretrained on stacks of observations."""
+    try:
+        return bool(load_encoder(encoder).metadata["preprocessing"].get("frame_stack", 1) > 1)
+    except EncoderNotFoundError:
+        return False  # whoever needs the file says so
 
 
 def normalizes_observations(normalize: Any) -> bool:

@@ -19,9 +19,10 @@ def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_environment_made_without_a_limit(tmp_path: Path) -> None:
     """-1 is Gymnasium's word for none."""
-    with pytest.warns(UserWarning, match="PlainEnv-v0 has no time limit"):
-        collect("PlainEnv-v0", 50, tmp_path / "d", n_envs=2, env_kwargs={"max_episode_steps": -1})
-    assert len(TransitionDataset(tmp_path / "d").valid_starts()) == 50
+    collect("PlainEnv-v0", 50, tmp_path / "d", n_envs=2, env_kwargs={"max_episode_steps": -1})
+    dataset = TransitionDataset(tmp_path / "d")
+    assert len(dataset.valid_starts()) == 50
+    assert dataset.meta["steps_per_shard"] * dataset.meta["shards_per_chain"] >= 8192
 
 
 def test_environment_of_somebody_else(tmp_path: Path) -> None:
@@ -61,10 +62,10 @@ def test_an_environment_that_draws_into_what_it_returned(tmp_path: Path) -> None
     np.testing.assert_array_equal(*frames)
 
 
-def test_an_environment_without_a_time_limit_is_a_warning(tmp_path: Path) -> None:
-    gym.register("Endless-v0", entry_point=index_env.PlainEnv)
-    with pytest.warns(UserWarning, match="Endless-v0 has no time limit, so that each episode is left after 24 steps"):
-        collect("Endless-v0", 60, tmp_path / "d", n_envs=2)
+def test_a_batch_without_a_time_limit_is_a_warning(tmp_path: Path) -> None:
+    gym.register("EndlessBatch-v0", vector_entry_point=index_env.IndexVectorEnv)
+    with pytest.warns(UserWarning, match="EndlessBatch-v0 has no time limit, so that each episode is left after 24"):
+        collect("EndlessBatch-v0", 60, tmp_path / "d", n_envs=2)
 
 
 def test_what_an_environment_cannot_open_is_not_blamed_on_the_folder(

@@ -112,8 +112,8 @@ def test_what_is_not_a_finished_dataset_is_refused_with_the_remedy(copy: Path, t
     with pytest.raises(DatasetError, match="other is not a dataset"):
         TransitionDataset(tmp_path / "other")
     meta = json.loads((copy / META_NAME).read_bytes())
-    (copy / META_NAME).write_text(json.dumps(meta | {"format_version": 3}))
-    with pytest.raises(DatasetError, match="format version 3, this version reads"):
+    (copy / META_NAME).write_text(json.dumps(meta | {"format_version": 4}))
+    with pytest.raises(DatasetError, match="format version 4, this version reads"):
         TransitionDataset(copy)
     (copy / META_NAME).unlink()
     with pytest.raises(DatasetError, match="unfinished"):

@@ -87,7 +87,7 @@ def test_shards_of_many_copies_fit_into_memory(tmp_path: Path) -> None:
     """64 copies of 500 steps would be 2 GiB of frames."""
     env = make_vector_env("ScanNav-v0", 64, {"scenes": 0, "goals_per_scene": 1})
     env.reset(seed=0)
-    assert collect_module._steps_per_shard(env, "ScanNav-v0", {}) == 500
+    assert collect_module._steps_of_whole_limits(env, "ScanNav-v0", 500) == 500
 
 
 def test_stopped_anywhere_the_same_command_ends_with_the_same_bytes(

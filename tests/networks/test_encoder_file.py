@@ -83,6 +83,7 @@ def test_round_trip(tmp_path: Path) -> None:
     versions = file.metadata.pop("versions")
     assert versions["torch"] == th.__version__.split("+")[0] or versions["torch"] == th.__version__
     assert file.metadata == {
+        "preprocessing": {},
         "observation_space": {
             "type": "Box",
             "shape": [3, 15, 15],

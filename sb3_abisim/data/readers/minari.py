@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sb3_abisim.common.spaces import fit_actions, is_channels_first, space_from_json, space_to_json
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import (
+    CHAINED_FORMAT_VERSION,
     CONTENT_HASH_KEY,
     CUT,
     FORMAT_VERSION,
@@ -233,7 +234,7 @@ def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[s
         if (
             not isinstance(ours, dict)
             or not set(IDENTITY_KEYS) <= ours.keys()
-            or ours["format_version"] not in (FORMAT_VERSION, RENDERED_FORMAT_VERSION)
+            or ours["format_version"] not in (FORMAT_VERSION, RENDERED_FORMAT_VERSION, CHAINED_FORMAT_VERSION)
         ):
             raise ValueError(f"Minari dataset {dataset_id} was exported by another version of sb3_abisim")
         check_factor_layout(ours["factors"])

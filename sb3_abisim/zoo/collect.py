@@ -1,0 +1,81 @@
+"""For ``sb3-abisim collect``: what the zoo puts between an environment and the algorithm.
+
+The zoo's YAML entry of an id (this package's, else rl-zoo3's own, or that of ``--conf-file``) gives ``env_wrapper``,
+``frame_stack`` and ``env_kwargs``, so that an encoder is pretrained on what ``sb3-abisim train`` shows it. With
+``--policy`` the model of a run acts.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_abisim.common.files import file_hash
+from sb3_abisim.data.collect import Policy
+from sb3_abisim.networks.encoder_file import RUN_COPY
+from sb3_abisim.registry import get_traits
+from sb3_abisim.rl.merge import merge_encoder
+from sb3_abisim.rl.vec_encode import EncodedBox
+from sb3_abisim.zoo.methods import PREPROCESSING_KEYS, hyperparameters_entry, normalizes_observations, read_entries
+from sb3_abisim.zoo.runs import read_run
+
+
+def preprocessing_entry(env_id: str, conf_file: str | None = None) -> dict[str, Any]:
+    """What stands between an environment and the algorithm in the zoo's entry of its id.
+
+    :param env_id: any id
+    :param conf_file: a YAML file of the zoo's form; None for this package's and rl-zoo3's own
+    :return: ``env_wrapper``, ``frame_stack`` and ``env_kwargs``, those that are given
+    :raises ValueError: if the file has no entry of this id, or normalizes observations
+    """
+    if conf_file is not None:
+        entries = read_entries(Path(conf_file))
+        if env_id not in entries:
+            raise ValueError(f"--conf-file {conf_file} has no entry {env_id}, only {', '.join(entries) or 'none'}")
+        entry = entries[env_id]
+    else:
+        entry = hyperparameters_entry(get_traits(env_id).algo, env_id)
+    # rl-zoo3's default entries normalize vectors; what shows images has no use for it, and says so at training.
+    if conf_file is not None and normalizes_observations(entry.get("normalize")):
+        raise ValueError(
+            f"--conf-file {conf_file} normalizes the observations of {env_id}, which would no longer be uint8 images; "
+            'give normalize: "dict(norm_obs=False, norm_reward=True)"'
+        )
+    keys = {*PREPROCESSING_KEYS, "env_kwargs"} - {"normalize"}
+    return {key: entry[key] for key in sorted(keys) if entry.get(key)}
+
+
+def model_policy(name: str, epsilon: float) -> Policy:
+    """A trained model's deterministic actions.
+
+    :param name: folder of a zoo run, whose final model acts, or a model's ``.zip`` in it; models are unpickled, so they
+        must be your own
+    :param epsilon: see :class:`~sb3_abisim.data.collect.Policy`
+    :raises ValueError: if it is none, or was trained on something else than observations
+    """
+    from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]
+
+    path = Path(name)
+    run = read_run(path if path.is_dir() else path.parent)
+    if normalizes_observations(run.settings.get("normalize")):
+        raise ValueError(f"{run.folder} was trained on normalized observations, which are not collected")
+    path = run.folder / f"{run.env_name}.zip" if path.is_dir() else path
+    if not path.is_file():
+        raise ValueError(f"--policy: there is no model {path}; give a run's folder, or a .zip in it")
+    model = ALGOS[run.algo].load(path, device="cpu")
+    if isinstance(model.observation_space, EncodedBox):
+        # Trained on embeddings.
+        model = merge_encoder(model, str(run.folder / run.env_name / RUN_COPY))
+    space = model.observation_space
+
+    def act(observations: NDArray[np.uint8]) -> NDArray[Any]:
+        if observations.shape[1:] != space.shape:
+            raise ValueError(
+                f"{path} takes observations {space.shape}, and the dataset's are {observations.shape[1:]}; give its "
+                "environment, --env-wrapper and --frame-stack"
+            )
+        actions: NDArray[Any] = model.predict(observations, deterministic=True)[0]
+        return actions
+
+    return Policy(act, f"{run.algo} {file_hash(path)[:16]}", epsilon)
