@@ -632,7 +632,9 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, pol
 
 
 def _command(args: argparse.Namespace) -> None:
-    entry = {} if args.entry_fn is None else args.entry_fn(args.env, args.conf_file)
+    # An unknown id is refused below.
+    known = args.entry_fn is not None and args.env in gym.registry
+    entry = args.entry_fn(args.env, args.conf_file) if known else {}
     env_kwargs = {**(entry.get("env_kwargs") or {}), **parse_pairs(args.env_kwargs, "--env-kwargs")}
     policy = None
     if args.policy_fn is not None and args.policy != "random":
