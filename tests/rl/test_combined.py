@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from extractor_inputs import ALGORITHMS, SPACE, RandomImages, register_batch_norm, write
+from extractor_inputs import ALGORITHMS, SPACE, RandomImages, write
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import NatureCNN
 
@@ -20,9 +20,7 @@ VECTOR = spaces.Box(-2.0, 2.0, (2, 3), np.float32)
 DICT = spaces.Dict({"camera": SPACE, "speed": VECTOR, "gear": spaces.Discrete(5), "wide": WIDE})
 
 
-@pytest.fixture(autouse=True)
-def batch_norm_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    register_batch_norm(monkeypatch)
+pytestmark = pytest.mark.usefixtures("batch_norm_is_known")
 
 
 class Robot(RandomImages):

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import stable_baselines3 as sb3
-from extractor_inputs import OBSERVATIONS, SPACE, RandomImages, build, register_batch_norm, write
+from extractor_inputs import OBSERVATIONS, SPACE, RandomImages, build, write
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -23,20 +23,7 @@ from sb3_abisim.rl.extractors import (
     network_arguments,
 )
 
-
-@pytest.fixture(autouse=True)
-def batch_norm_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    register_batch_norm(monkeypatch)
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return write(tmp_path / "e.safetensors")
-
-
-@pytest.fixture
-def batch_norm_path(tmp_path: Path) -> Path:
-    return write(tmp_path / "bn.safetensors", "BatchNorm")
+pytestmark = pytest.mark.usefixtures("batch_norm_is_known")
 
 
 EXTRACTORS: dict[str, Any] = {

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import stable_baselines3 as sb3
 import torch as th
-from extractor_inputs import ALGORITHMS, OBSERVATIONS, SPACE, VARIANTS, RandomImages, build, register_batch_norm, write
+from extractor_inputs import ALGORITHMS, OBSERVATIONS, SPACE, VARIANTS, RandomImages, build, write
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -27,20 +27,7 @@ from sb3_abisim.rl.extractors import (
     VanillaExtractor,
 )
 
-
-@pytest.fixture(autouse=True)
-def batch_norm_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    register_batch_norm(monkeypatch)
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    return write(tmp_path / "e.safetensors")
-
-
-@pytest.fixture
-def batch_norm_path(tmp_path: Path) -> Path:
-    return write(tmp_path / "bn.safetensors", "BatchNorm")
+pytestmark = pytest.mark.usefixtures("batch_norm_is_known")
 
 
 def all_extractors(model: BaseAlgorithm) -> list[PretrainedExtractor]:

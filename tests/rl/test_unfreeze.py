@@ -7,17 +7,14 @@ import numpy as np
 import pytest
 import stable_baselines3 as sb3
 import torch as th
-from extractor_inputs import OBSERVATIONS, SPACE, VARIANTS, RandomImages, build, register_batch_norm, write
+from extractor_inputs import OBSERVATIONS, SPACE, VARIANTS, RandomImages, build, write
 from torch import nn
 
 from sb3_abisim import ActionBisimExtractor, load_encoder, unfreeze_encoder
 from sb3_abisim.rl.checks import find_extractors
 from sb3_abisim.rl.extractors import PretrainedExtractor
 
-
-@pytest.fixture(autouse=True)
-def batch_norm_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    register_batch_norm(monkeypatch)
+pytestmark = pytest.mark.usefixtures("batch_norm_is_known")
 
 
 def shapes(optimizer: th.optim.Optimizer) -> list[tuple[int, ...]]:

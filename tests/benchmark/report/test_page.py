@@ -1,35 +1,18 @@
 """The page of a report, its figures and its files."""
 
 import re
-from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_inputs import N_EPISODES, write_all
+from benchmark_inputs import N_EPISODES
 from PIL import Image
 
-from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.benchmark.report.figures import MINUS, assign_colors
 from sb3_abisim.benchmark.report.page import _verdict, report
 
-
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_all(tmp_path_factory.mktemp("runs"))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_resamples() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(statistics, "N_RESAMPLES", 50)  # rliable is slow
-        yield
-
-
-@pytest.fixture(scope="module")
-def made(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return report([str(logs)], tmp_path_factory.mktemp("report")).parent
+pytestmark = pytest.mark.usefixtures("few_resamples")
 
 
 class Page(HTMLParser):

@@ -1,34 +1,17 @@
 """The tables of a report, from run folders alone."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmark_inputs import STEPS, read_csv, write_all, write_run
+from benchmark_inputs import STEPS, read_csv, write_run
 
 from sb3_abisim.benchmark.command import main
 from sb3_abisim.benchmark.report import statistics
-from sb3_abisim.benchmark.report.page import report
 from sb3_abisim.benchmark.report.tables import compare
 from sb3_abisim.zoo.runs import read_run
 
-
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_all(tmp_path_factory.mktemp("runs"))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_resamples() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(statistics, "N_RESAMPLES", 50)  # rliable is slow
-        yield
-
-
-@pytest.fixture(scope="module")
-def made(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return report([str(logs)], tmp_path_factory.mktemp("report")).parent
+pytestmark = pytest.mark.usefixtures("few_resamples")
 
 
 def test_curves_hold_mean_and_interval(made: Path) -> None:
