@@ -20,7 +20,7 @@ FOLLOWING = {"k", "encoder", "action_space", "base_encoder"}
 class PretrainConfig:
     """The settings of one pretraining run; the keys of the YAML files are these names.
 
-    :param n_updates: optimizer steps
+    :param n_updates: optimizer steps; 0 leaves the weights as they begin, standardized: the control of an encoder
     :param batch_size: transitions per update
     :param learning_rate: of Adam; a number keeps it constant, ``lin_NUMBER`` lowers it in a straight line to 0, as in
         the zoo's files
@@ -50,9 +50,9 @@ class PretrainConfig:
 
     def __post_init__(self) -> None:
         for name in ("n_updates", "batch_size", "chunk_length", "log_interval", "checkpoint_interval"):
-            value = getattr(self, name)
-            if not _is_count(value):
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+            value, least = getattr(self, name), 0 if name == "n_updates" else 1
+            if not _is_count(value, least):
+                raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
         bounds = self.k if isinstance(self.k, list) and len(self.k) == 2 else [self.k, self.k]
         if not all(map(_is_count, bounds)) or bounds[0] > bounds[1]:  # type: ignore[operator]
             raise ValueError(f"k must be a whole number of at least 1, or [fewest, most], got {self.k!r}")
@@ -79,7 +79,7 @@ class PretrainConfig:
             initial = 0.0
         if not self.learning_rate.startswith("lin_") or not initial > 0:
             raise ValueError(f"learning_rate must be a number or lin_NUMBER, got {self.learning_rate!r}")
-        return initial * (1.0 - n_updates / self.n_updates)
+        return initial * (1.0 - n_updates / max(self.n_updates, 1))
 
     def as_settings(self) -> dict[str, Any]:
         """The settings by name, as encoder files hold them.
@@ -105,8 +105,8 @@ class PretrainConfig:
         return cls(**mapping)
 
 
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 1
+def _is_count(value: Any, least: int = 1) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= least
 
 
 def load_config(objective: str, env_id: str, overrides: dict[str, Any] | None = None) -> PretrainConfig:

@@ -3,10 +3,13 @@
 import json
 
 import pytest
+import torch as th
 from pretrain_inputs import SETTINGS, collect_grids, run
 
 from sb3_abisim.data.collect import collect
+from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.pretraining.card import read_card
 from sb3_abisim.pretraining.config import PretrainConfig, load_config
 from sb3_abisim.pretraining.pretrain import main, pretrain
 
@@ -47,6 +50,23 @@ def test_abisim_trains_its_base_first(data, tmp_path, monkeypatch):
     metadata = load_encoder(str(output)).metadata
     assert base.metadata["objective"] == "ssi" and metadata["objective"] == "abisim"
     assert metadata["settings"]["base_hash"] == base.hash
+
+
+def test_no_updates_make_the_control_of_an_encoder(data, tmp_path):
+    """Goal progress without an update: the base's convolutions and an untrained layer, standardized."""
+    base = run(data, tmp_path / "ssi.safetensors")
+    config = {**SETTINGS, "n_updates": 0, "network_kwargs.hidden_dim": 24, "objective_kwargs.n_goals": 4}
+    output = tmp_path / "control.safetensors"
+    for _ in range(2):  # the second finds it finished
+        pretrain("goal_progress", data, output, config, base=str(base), progress_bar=False, verbose=0)
+    control, trained = load_encoder(output).encoder, load_encoder(base).encoder
+    shared = dict(trained.layers.named_parameters())
+    assert shared and all(th.equal(own, shared[n]) for n, own in control.layers.named_parameters() if n in shared)
+    dataset = TransitionDataset(data, eval_fraction=SETTINGS.get("eval_fraction", 0.05))
+    frames = th.as_tensor(dataset.frames(dataset.valid_starts(split="train"))).float() / 255
+    with th.no_grad():
+        assert control(frames).shape == (len(frames), 24) and 0.8 < control(frames).var(dim=0).mean() < 1.25
+    assert read_card(output.with_suffix(".json"))["metrics"] == {}
 
 
 def test_a_base_made_on_the_way_has_the_network_asked_for(data, tmp_path, monkeypatch):
