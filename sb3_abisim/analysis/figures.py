@@ -11,7 +11,7 @@ from typing import Any
 from sb3_abisim.analysis import curves, leak, neighbors, perturbation, pixels, plots, plots_pixels, probes, sweep
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.data.collect import make_vector_env
+from sb3_abisim.data.environments import make_vector_env
 from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
 from sb3_abisim.registry import get_traits
 

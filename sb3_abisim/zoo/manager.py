@@ -36,7 +36,8 @@ from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.checks import check_trained_with, find_extractors
-from sb3_abisim.rl.extractors import BaseEncoderExtractor, method_of
+from sb3_abisim.rl.extractor_classes import method_of
+from sb3_abisim.rl.extractors import BaseEncoderExtractor
 from sb3_abisim.zoo.methods import (
     PREPROCESSING_KEYS,
     MethodRecord,

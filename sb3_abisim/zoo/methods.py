@@ -15,7 +15,7 @@ from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
-from sb3_abisim.rl.extractors import network_arguments
+from sb3_abisim.rl.file_network import network_arguments
 
 ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
 ENCODER_CALLBACK = "sb3_abisim.EncoderCallback"

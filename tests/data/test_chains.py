@@ -12,10 +12,12 @@ import pytest
 from dataset_inputs import rewrite_meta, tree
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecTransposeImage
 
+from sb3_abisim.data import chains, environments
 from sb3_abisim.data import collect as collect_module
-from sb3_abisim.data.collect import Policy, collect
+from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, INSIDE, META_NAME, DatasetError
+from sb3_abisim.data.rollout import Policy
 
 N_ENVS, STEPS, SHARDS = 3, 4, 5
 PER_SHARD, PER_CHAIN = N_ENVS * STEPS, N_ENVS * STEPS * SHARDS
@@ -58,7 +60,7 @@ gym.register("Long-v0", entry_point=LongEnv, max_episode_steps=STEPS * SHARDS)
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect_module, "CHAINED_SHARD_TRANSITIONS", PER_SHARD)
+    monkeypatch.setattr(chains, "CHAINED_SHARD_TRANSITIONS", PER_SHARD)
 
 
 def collect_long(folder: Path, n: int = 150, **kwargs: Any) -> TransitionDataset:
@@ -118,7 +120,7 @@ def test_stacks_are_those_of_vec_frame_stack(
     tmp_path: Path, channels_last: bool, n_stack: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Replay: the recorded actions of the first chain, from the same seeds, through SB3's wrappers."""
-    monkeypatch.setattr(collect_module, "CHAINED_SHARD_TRANSITIONS", N_ENVS)  # shards of one step
+    monkeypatch.setattr(chains, "CHAINED_SHARD_TRANSITIONS", N_ENVS)  # shards of one step
     monkeypatch.setattr(index_env, "SHAPE", (3, 10, 11))
     kwargs = {"channels_last": channels_last}
     dataset = collect_long(tmp_path / "d", 60, env_kwargs=kwargs, frame_stack=n_stack)
@@ -213,7 +215,7 @@ def test_the_default_number_of_copies_is_that_of_the_folder(tmp_path: Path) -> N
     collect("Long-v0", 40, tmp_path / "d", seed=2)
     assert TransitionDataset(tmp_path / "d").meta["n_envs"] == N_ENVS
     collect("Long-v0", 40, tmp_path / "e", seed=2)
-    assert TransitionDataset(tmp_path / "e").meta["n_envs"] == collect_module.N_COPIES
+    assert TransitionDataset(tmp_path / "e").meta["n_envs"] == environments.N_COPIES
 
 
 def test_a_function_makes_the_environment(tmp_path: Path) -> None:
