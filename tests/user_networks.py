@@ -24,4 +24,10 @@ def tiny(observation_space: gym.Space[Any]) -> nn.Module:
     return nn.Sequential(nn.Conv2d(observation_space.shape[0], 5, 3, stride=3), nn.BatchNorm2d(5), nn.Flatten())
 
 
+def with_hidden_dim(observation_space: gym.Space[Any], hidden_dim: int = 3) -> nn.Module:
+    """Calls an argument of its own as ours is called."""
+    n_inputs = gym.spaces.flatdim(observation_space)
+    return nn.Sequential(nn.Flatten(), nn.Linear(n_inputs, hidden_dim), nn.ReLU(), nn.Linear(hidden_dim, 4))
+
+
 NOT_A_FACTORY = 3

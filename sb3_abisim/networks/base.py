@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
+from sb3_abisim.networks.top import split_arguments, with_top
 from sb3_abisim.registry import get_network, import_network, is_import_path, networks
 
 # The least side of images for the network "nature".
@@ -67,6 +68,34 @@ class Encoder(nn.Module):
         super().apply(fn)
         set_memory_format(self, th.channels_last)
         return self
+
+    def put_on_top(self, **top: Any) -> None:
+        """Give RL something else of this network, before it has been trained.
+
+        :param top: ``features`` and ``hidden_dim`` of :func:`~sb3_abisim.networks.top.with_top`
+        """
+        self.layers = with_top(self._name, self.layers, self.input_shape, **top)
+        # Only what differs from the plain network is named, so that equal networks have equal specs.
+        plain = {"features": "embedding", "hidden_dim": None}
+        self._network_kwargs |= {name: value for name, value in top.items() if value != plain[name]}
+        self.features_dim = _features_dim(self._name, self.layers, self.input_shape)
+        self.offset = th.zeros(self.features_dim)
+        set_memory_format(self, th.channels_last)
+
+    def warm_start(self, other: "Encoder") -> int:
+        """Take the weights of all layers that another network has, too.
+
+        :param other: any
+        :return: number of weights taken
+        """
+        own, theirs = self._parts().state_dict(), other._parts().state_dict()
+        shared = {key: theirs[key] for key in own if key in theirs and theirs[key].shape == own[key].shape}
+        self._parts().load_state_dict(own | shared)
+        return sum(tensor.numel() for tensor in shared.values())
+
+    def _parts(self) -> nn.Sequential:
+        """The layers; those of any other module as the first part, as they are under a layer on top."""
+        return self.layers if isinstance(self.layers, nn.Sequential) else nn.Sequential(self.layers)
 
     def spec(self) -> dict[str, Any]:
         """The architecture as JSON: ``make_encoder(space, spec["name"], **spec["kwargs"])`` builds it again."""
@@ -130,7 +159,8 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     :param observation_space: a channels-first image space
     :param name: of a registered network, or ``pkg.module:Factory``, which is imported: never a name that only a file
         holds; None takes :func:`default_network`
-    :param kwargs: keyword arguments of its factory
+    :param kwargs: keyword arguments of its factory, and ``features`` and ``hidden_dim``, which every network takes
+        (:mod:`sb3_abisim.networks.top`)
     :raises ValueError: for an unknown name or keyword, or a space that the network does not fit
     """
     shape = observation_space.shape
@@ -140,17 +170,20 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
         name = default_network(shape)
     if is_import_path(name):
         import_network(name)
-    network = get_network(name)
+    factory = get_network(name).factory
+    own_kwargs, top = split_arguments(factory, kwargs)
     try:
-        module = network.factory(observation_space, **kwargs)
+        module = factory(observation_space, **own_kwargs)
     except TypeError as error:
         raise ValueError(f"{name} does not take these arguments: {error}") from error
     if not isinstance(module, Encoder):
-        module = Encoder(module, _features_dim(name, module, shape), name, kwargs, shape)
+        module = Encoder(module, _features_dim(name, module, shape), name, own_kwargs, shape)
     # SB3 turns observations into float32, whatever torch's default is.
     encoder: Encoder = module.float()
     if shape != encoder.input_shape:
         raise ValueError(f"{name} takes observations of shape {encoder.input_shape}, got {shape}")
+    if top:
+        encoder.put_on_top(**top)
     return encoder
 
 

@@ -18,17 +18,10 @@ from sb3_abisim.registry import register_network
 class PaperEncoder(Encoder):
     """An encoder for one size of image, with any number of channels.
 
-    What RL is given is a choice of its own: the embedding, as in the paper, or the trunk, which is what the last layers
-    get, and either of them with a linear layer and ReLU on top.
-
     :param layers: module from float images in -1..1 to (batch, features_dim)
     :param features_dim: size of the embedding
     :param network_kwargs: the constructor's keyword arguments, among them ``n_input_channels``
     :param image_size: height and width; None for those of ``observation_shape``
-    :param n_last: number of last layers, which make the embedding out of the trunk
-    :param features: "embedding" or "trunk"
-    :param hidden_dim: units of a layer on top; None for none
-    :raises ValueError: for other ``features``, or a ``hidden_dim`` below 1
     """
 
     # (channels, height, width) that the network is the default for.
@@ -40,26 +33,9 @@ class PaperEncoder(Encoder):
         features_dim: int,
         network_kwargs: dict[str, Any],
         image_size: int | None = None,
-        n_last: int = 2,
-        features: str = "embedding",
-        hidden_dim: int | None = None,
     ) -> None:
-        if features not in ("embedding", "trunk"):
-            raise ValueError(f"features must be 'embedding' or 'trunk', got {features!r}")
-        if hidden_dim is not None and (not isinstance(hidden_dim, int) or hidden_dim < 1):
-            raise ValueError(f"hidden_dim must be a whole number of at least 1, or None, got {hidden_dim!r}")
         size = self.observation_shape[1:] if image_size is None else (image_size, image_size)
         shape = (network_kwargs["n_input_channels"], *size)
-        # Only what differs from the paper is named, so that files from before the options stay equal.
-        if features == "trunk":
-            layers = nn.Sequential(*list(layers)[:-n_last], nn.Flatten())
-            with th.no_grad():
-                features_dim = layers(th.zeros(1, *shape)).shape[1]
-            network_kwargs = {**network_kwargs, "features": features}
-        if hidden_dim is not None:
-            layers = nn.Sequential(*layers, nn.Linear(features_dim, hidden_dim), nn.ReLU(inplace=True))
-            features_dim = hidden_dim
-            network_kwargs = {**network_kwargs, "hidden_dim": hidden_dim}
         super().__init__(layers, features_dim, type(self).__name__, network_kwargs, shape)
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
@@ -80,13 +56,12 @@ class Nav2DEncoder(PaperEncoder):
 
     :param n_input_channels: channels of the observation
     :param features_dim: size of the embedding, 9 for each channel of the last convolution
-    :param top: ``features`` and ``hidden_dim`` of :class:`PaperEncoder`
     :raises ValueError: if ``features_dim`` is not a multiple of 9
     """
 
     observation_shape = (3, 15, 15)
 
-    def __init__(self, n_input_channels: int = 3, features_dim: int = 576, **top: Any) -> None:
+    def __init__(self, n_input_channels: int = 3, features_dim: int = 576) -> None:
         if features_dim < 1 or features_dim % 9:
             raise ValueError(f"features_dim must be a multiple of 9, got {features_dim!r}")
         layers = nn.Sequential(
@@ -98,7 +73,7 @@ class Nav2DEncoder(PaperEncoder):
             nn.Flatten(),
         )
         kwargs = {"n_input_channels": n_input_channels, "features_dim": features_dim}
-        super().__init__(layers, features_dim, kwargs, **top)
+        super().__init__(layers, features_dim, kwargs)
 
 
 class PointMazeEncoder(PaperEncoder):
@@ -109,12 +84,11 @@ class PointMazeEncoder(PaperEncoder):
 
     :param n_input_channels: channels of the observation
     :param features_dim: size of the embedding, 32 in the paper
-    :param top: ``features`` and ``hidden_dim`` of :class:`PaperEncoder`
     """
 
     observation_shape = (3, 64, 64)
 
-    def __init__(self, n_input_channels: int = 3, features_dim: int = 32, **top: Any) -> None:
+    def __init__(self, n_input_channels: int = 3, features_dim: int = 32) -> None:
         layers = nn.Sequential(
             nn.Conv2d(n_input_channels, 8, 3, stride=2, padding=1),
             nn.ReLU(inplace=True),
@@ -126,21 +100,20 @@ class PointMazeEncoder(PaperEncoder):
             nn.Flatten(),
         )
         kwargs = {"n_input_channels": n_input_channels, "features_dim": features_dim}
-        super().__init__(layers, features_dim, kwargs, **top)
+        super().__init__(layers, features_dim, kwargs)
 
 
 class ScanNavEncoder(PaperEncoder):
     """128 x 128 RGB-D images to 2048 numbers: a small network for CPUs, which the paper does not have.
 
     :param n_input_channels: channels of the observation
-    :param top: ``features`` and ``hidden_dim`` of :class:`PaperEncoder`
     """
 
     observation_shape = (4, 128, 128)
 
-    def __init__(self, n_input_channels: int = 4, **top: Any) -> None:
+    def __init__(self, n_input_channels: int = 4) -> None:
         layers = small_layers(n_input_channels)
-        super().__init__(layers, FEATURES_DIM, {"n_input_channels": n_input_channels}, **top)
+        super().__init__(layers, FEATURES_DIM, {"n_input_channels": n_input_channels})
 
 
 class ScanNavResNet18(PaperEncoder):
@@ -148,19 +121,17 @@ class ScanNavResNet18(PaperEncoder):
 
     :param n_input_channels: channels of the observation
     :param image_size: its height and width, 64, 128 or 256
-    :param top: ``features`` and ``hidden_dim`` of :class:`PaperEncoder`
     :raises ValueError: for another ``image_size``, at which there would not be 2048 numbers
     """
 
     observation_shape = (4, 256, 256)
 
-    def __init__(self, n_input_channels: int = 4, image_size: int = 256, **top: Any) -> None:
+    def __init__(self, n_input_channels: int = 4, image_size: int = 256) -> None:
         if image_size not in (64, 128, 256):
             raise ValueError(f"image_size must be 64, 128 or 256, got {image_size!r}")
         layers = resnet18_layers(n_input_channels, image_size)
         kwargs = {"n_input_channels": n_input_channels, "image_size": image_size}
-        # Its last four layers compress.
-        super().__init__(layers, FEATURES_DIM, kwargs, image_size, n_last=4, **top)
+        super().__init__(layers, FEATURES_DIM, kwargs, image_size)
 
 
 def _factory(network_class: type[PaperEncoder]) -> Callable[..., PaperEncoder]:

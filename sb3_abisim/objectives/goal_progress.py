@@ -174,17 +174,11 @@ class GoalProgress(Objective):
                 raise ValueError(f"{name} must be a number of at least 0, got {value}")
         self.n_goals, self.goal_share, self.gamma, self.tau = n_goals, goal_share, gamma, tau
         self.value_weight, self.progress_weight = value_weight, progress_weight
-        if warm_start:
-            own, base = encoder.state_dict(), base_encoder.state_dict()
-            shared = {
-                k: base[k] for k in own if k.startswith("layers.") and k in base and base[k].shape == own[k].shape
-            }
-            if not shared:
-                raise ValueError(
-                    f"warm_start: {encoder.spec()} has no layer of its base {base_encoder.spec()}; give another "
-                    "network or warm_start: false"
-                )
-            encoder.load_state_dict(own | shared)
+        if warm_start and not encoder.warm_start(base_encoder):
+            raise ValueError(
+                f"warm_start: {encoder.spec()} has no layer of its base {base_encoder.spec()}; give another network or "
+                "warm_start: false"
+            )
         self.base_encoder = copy.deepcopy(base_encoder).requires_grad_(False)
         self.value_head = GoalHead(encoder.features_dim, n_goals, self.actions)
         self.progress_head = GoalHead(encoder.features_dim, n_goals, self.actions)

@@ -243,30 +243,54 @@ def test_the_memory_format_changes_no_weight():
 
 
 @pytest.mark.parametrize(
-    ("shape", "kwargs", "features_dim"),
+    ("network", "shape", "kwargs", "features_dim"),
     [
-        ((3, 15, 15), {"features": "trunk"}, 64 * 5 * 5),
-        ((3, 15, 15), {"hidden_dim": 12}, 12),
-        ((3, 64, 64), {"features": "trunk"}, 16 * 8 * 8),
-        ((3, 64, 64), {"features": "trunk", "hidden_dim": 12}, 12),
-        ((4, 128, 128), {"features": "trunk"}, 32 * 16 * 16),
+        (None, (3, 15, 15), {"features": "trunk"}, 64 * 5 * 5),
+        (None, (3, 15, 15), {"hidden_dim": 12}, 12),
+        (None, (3, 64, 64), {"features": "trunk"}, 16 * 8 * 8),
+        (None, (3, 64, 64), {"features": "trunk", "hidden_dim": 12}, 12),
+        (None, (4, 128, 128), {"features": "trunk"}, 32 * 16 * 16),
+        ("ScanNavResNet18", (4, 64, 64), {"features": "trunk", "image_size": 64}, 256),
+        ("nature", (2, 40, 44), {"features": "trunk"}, 64 * 1 * 2),
+        ("nature", (2, 40, 44), {"features": "trunk", "hidden_dim": 12}, 12),
+        ("impala", (2, 20, 20), {"features": "trunk", "hidden_dim": 12}, 12),
+        ("resnet18", (2, 33, 33), {"features": "trunk"}, 256 * 2 * 2),
+        ("small", (1, 7, 7), {"features": "trunk"}, 64 * 2 * 2),
     ],
 )
-def test_the_papers_networks_hand_out_their_trunk_or_a_layer_on_top(shape, kwargs, features_dim) -> None:
+def test_every_network_hands_out_its_trunk_or_a_layer_on_top(network, shape, kwargs, features_dim) -> None:
     space = image_space(*shape)
-    plain, encoder = make_encoder(space), make_encoder(space, None, **kwargs)
+    own = {name: value for name, value in kwargs.items() if name not in ("features", "hidden_dim")}
+    plain, encoder = make_encoder(space, network, **own), make_encoder(space, network, **kwargs)
     assert encoder.features_dim == features_dim
     again = make_encoder(space, encoder.spec()["name"], **encoder.spec()["kwargs"])
     assert again.spec() == encoder.spec() != plain.spec()
-    # The layers that both have are called alike, so that one can begin where the other ended.
-    shared = set(plain.state_dict()) & set(encoder.state_dict())
-    assert {"layers.0.weight", "layers.2.weight"} <= shared
+    assert encoder.warm_start(plain) > 0
+    first = next(name for name, _ in plain.named_parameters())
+    assert th.equal(encoder.state_dict()[first], plain.state_dict()[first])
     x = th.rand(2, *shape)
     with th.no_grad():
         features = encoder(x)
     assert features.shape == (2, features_dim)
     if "hidden_dim" in kwargs:
         assert float(features.min()) >= 0
+
+
+def test_a_network_that_is_one_module_takes_a_layer_on_top_but_has_no_trunk():
+    space = image_space(3, 9, 9)
+    network = "user_networks:Pooled"
+    plain, encoder = make_encoder(space, network), make_encoder(space, network, hidden_dim=5)
+    assert encoder.features_dim == 5 and encoder.spec()["kwargs"] == {"hidden_dim": 5}
+    n_shared = sum(tensor.numel() for tensor in plain.layers.state_dict().values())
+    assert encoder.warm_start(plain) == n_shared
+    with pytest.raises(ValueError, match=r"features='trunk' needs a network that is an nn.Sequential.*features:embed"):
+        make_encoder(space, network, features="trunk")
+
+
+def test_arguments_of_a_networks_own_stay_its_own():
+    encoder = make_encoder(image_space(3, 9, 9), "user_networks:with_hidden_dim", hidden_dim=7)
+    assert encoder.features_dim == 4 and encoder.layers[1].out_features == 7
+    assert encoder.spec()["kwargs"] == {"hidden_dim": 7}
 
 
 @pytest.mark.parametrize(
