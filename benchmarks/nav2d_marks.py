@@ -15,26 +15,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.grids import fewest_steps
 from sb3_abisim.envs.nav2d import GOAL, MOVES, SIZE, next_cells
 
 N_CELLS = SIZE * SIZE
 GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
 RADIUS = 4
 N_AROUND = (2 * RADIUS + 1) ** 2
-
-
-def steps_to_goal(nexts: NDArray[np.int64]) -> NDArray[np.float32]:
-    """The fewest steps from each cell to the goal; N_CELLS where there is no path.
-
-    :param nexts: where each move leads, of :func:`~sb3_abisim.envs.nav2d.next_cells`
-    """
-    steps = np.full(N_CELLS, N_CELLS, dtype=np.float32)
-    steps[GOAL_CELL] = 0
-    while True:
-        shorter = np.minimum(steps, steps[nexts].min(axis=1) + 1)
-        if np.array_equal(shorter, steps):
-            return steps
-        steps = shorter
 
 
 class Privileged(gym.ObservationWrapper[NDArray[np.float32], Any, NDArray[np.uint8]]):
@@ -66,7 +53,8 @@ class Privileged(gym.ObservationWrapper[NDArray[np.float32], Any, NDArray[np.uin
             if not np.array_equal(obstacles.ravel(), self._obstacles):
                 self._obstacles = obstacles.ravel()
                 nexts = next_cells(self._obstacles)
-                steps = steps_to_goal(nexts)
+                # Cells without a path to the goal are never visited.
+                steps = np.minimum(fewest_steps(nexts, np.array([GOAL_CELL]))[:, 0], N_CELLS)
                 self._gains = steps[:, None] - steps[nexts]
             parts.append(SIZE * np.clip(self._gains[y * SIZE + x], -1, 1))
         return np.concatenate(parts).astype(np.float32)

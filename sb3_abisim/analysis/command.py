@@ -15,7 +15,7 @@ from typing import Any
 
 from sb3_abisim.analysis import probes
 from sb3_abisim.analysis.figures import FIGURES, default_encoders, load_all, make_figure, make_sweep
-from sb3_abisim.analysis.nav2d_exact import BINS, EVAL_SEED, ExactReference, check_nav2d
+from sb3_abisim.analysis.nav2d_exact import BINS, EVAL_SEED, STEPS, ExactReference, check_nav2d
 from sb3_abisim.analysis.sweep import PAPER_C
 from sb3_abisim.common.cli import make_parser, run
 from sb3_abisim.common.files import write_atomic
@@ -54,23 +54,30 @@ def exact(
     for name, file in files.items():
         results[name] = {"hash": file.hash, **asdict(reference.compare(file.encoder.eval()))}
     settings = {"env_id": env_id, "base": base, "base_hash": base_file.hash, "c": c}
-    return {**settings, "n_layouts": n_layouts, "seed": seed, "bins": BINS, "encoders": results}
+    return {**settings, "n_layouts": n_layouts, "seed": seed, "bins": BINS, "steps": STEPS, "encoders": results}
 
 
 def table(results: dict[str, Any]) -> str:
-    """The results of :func:`exact` as a Markdown table.
+    """The results of :func:`exact` as two Markdown tables: the comparison, and distances by steps.
 
     :param results: what it returned
     """
     bins = [f"{low}" if low == high else f"{low}-{high}" for low, high in results["bins"]]
-    header = ["encoder", "map correlation", "state correlation", "profile error", *bins]
-    rows = [header, ["---", *["---:"] * (len(header) - 1)]]
+    rows = [["encoder", "map correlation", "state correlation", "profile error", *bins]]
+    steps = [["distance of states so many steps apart", *map(str, results["steps"])]]
     for name, result in results["encoders"].items():
         numbers = [result["map_correlation"], result["state_correlation"], result["profile_error"], *result["profile"]]
         rows.append([name, *(f"{number:.3f}" for number in numbers)])
-    exact_profile = next(iter(results["encoders"].values()))["exact_profile"]
-    rows.append(["exact metric", "1", "1", "0", *(f"{number:.3f}" for number in exact_profile)])
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+        steps.append([name, *(f"{number:.2f}" for number in result["step_profile"])])
+    first = next(iter(results["encoders"].values()))
+    rows.append(["exact metric", "1", "1", "0", *(f"{number:.3f}" for number in first["exact_profile"])])
+    steps.append(["exact metric", *(f"{number:.2f}" for number in first["exact_step_profile"])])
+    return f"{_markdown(rows)}\n\n{_markdown(steps)}"
+
+
+def _markdown(rows: list[list[str]]) -> str:
+    lines = [rows[0], ["---", *["---:"] * (len(rows[0]) - 1)], *rows[1:]]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

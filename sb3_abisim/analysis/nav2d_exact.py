@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import preprocess_obs
 
 from sb3_abisim.analysis.exact_metric import action_bisim_metric
-from sb3_abisim.common.grids import flood_fill, pack, unpack
+from sb3_abisim.common.grids import fewest_steps, flood_fill, pack, unpack
 from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.nav2d import CHANNELS, GOAL, SIZE, Nav2DVectorEnv, next_cells
 from sb3_abisim.networks.base import Encoder
@@ -29,6 +29,8 @@ N_CELLS = SIZE * SIZE
 GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
 # Bins of the city-block distance from agent to cell, both ends included.
 BINS = ((1, 1), (2, 2), (3, 3), (4, 4), (5, 6), (7, 9), (10, 2 * (SIZE - 1)))
+# Steps of the shortest path between two states.
+STEPS = tuple(range(1, 13))
 # Far offsets that few agents see are noise.
 MIN_SAMPLES = 20
 # Far from the seeds that people type, and from those that a dataset's copies get of its seed.
@@ -54,6 +56,9 @@ class Comparison:
     :param profile: learned sensitivity by distance (:data:`BINS`), relative to the nearest
     :param exact_profile: the exact one
     :param profile_error: largest difference of the two
+    :param step_profile: learned distance between states so many steps apart (:data:`STEPS`), relative to the mean
+        distance in their layout
+    :param exact_step_profile: the exact one
     """
 
     map_correlation: float
@@ -61,6 +66,8 @@ class Comparison:
     profile: tuple[float, ...]
     exact_profile: tuple[float, ...]
     profile_error: float
+    step_profile: tuple[float, ...]
+    exact_step_profile: tuple[float, ...]
 
 
 def check_nav2d(env_id: str) -> None:
@@ -223,6 +230,26 @@ def profile(maps: Maps) -> NDArray[np.float64]:
     return relative
 
 
+def step_profile(distances: list[NDArray[Any]], steps: list[NDArray[np.float32]]) -> NDArray[np.float64]:
+    """Mean distance between states so many steps apart (:data:`STEPS`), relative to the mean in their layout.
+
+    A distance that saturates is 1 from a few steps on.
+
+    :param distances: between the reachable states of each layout, (n, n)
+    :param steps: of the shortest paths between them, (n, n)
+    :return: mean over layouts, NaN where no layout has such states
+    """
+    sums, counts = np.zeros(len(STEPS)), np.zeros(len(STEPS))
+    for distance, apart in zip(distances, steps, strict=True):
+        mean = distance[apart > 0].mean()
+        for i, n in enumerate(STEPS):
+            if (apart == n).any():
+                sums[i] += distance[apart == n].mean() / mean
+                counts[i] += 1
+    profile: NDArray[np.float64] = np.divide(sums, counts, out=np.full(len(STEPS), np.nan), where=counts > 0)
+    return profile
+
+
 class ExactReference:
     """The exact side of the comparison, computed once for a base encoder and c; then any encoder is compared with it.
 
@@ -239,6 +266,11 @@ class ExactReference:
         self.layouts = eval_layouts(env_id, n_layouts, seed)
         self.maps = exact_maps(base, self.layouts, c)
         self._distances = [exact_distances(base, obstacles, c) for obstacles in self.layouts]
+        cells = [reachable(obstacles) for obstacles in self.layouts]
+        self._steps = [
+            fewest_steps(next_cells(obstacles), states)[states]
+            for obstacles, states in zip(self.layouts, cells, strict=True)
+        ]
 
     def compare(self, encoder: Encoder) -> Comparison:
         """Compare an encoder with the exact metric.
@@ -249,11 +281,12 @@ class ExactReference:
         learned, exact = mean_map(maps).ravel(), mean_map(self.maps).ravel()
         # Not where the agent stands, nor where too few agents have looked.
         seen = ~np.isnan(learned) & ~np.isnan(exact)
-        states = []
-        for obstacles, distances in zip(self.layouts, self._distances, strict=True):
+        states, distances = [], []
+        for obstacles, exact_distance in zip(self.layouts, self._distances, strict=True):
             features = embed(encoder, observations(obstacles, reachable(obstacles)))
-            pairs = np.triu_indices(len(distances), k=1)
-            states.append(spearman(th.cdist(features, features, p=1.0).numpy()[pairs], distances[pairs]))
+            distances.append(th.cdist(features, features, p=1.0).numpy())
+            pairs = np.triu_indices(len(exact_distance), k=1)
+            states.append(spearman(distances[-1][pairs], exact_distance[pairs]))
         here, there = profile(maps), profile(self.maps)
         return Comparison(
             map_correlation=spearman(learned[seen], exact[seen]),
@@ -261,6 +294,8 @@ class ExactReference:
             profile=tuple(here.tolist()),
             exact_profile=tuple(there.tolist()),
             profile_error=float(np.abs(here - there).max()),
+            step_profile=tuple(step_profile(distances, self._steps).tolist()),
+            exact_step_profile=tuple(step_profile(self._distances, self._steps).tolist()),
         )
 
     def terms(self, encoder: Encoder) -> dict[str, float]:

@@ -45,3 +45,19 @@ def flood_fill(start: int, free: int, stride: int, stop: int = 0) -> int:
             break
         reached = grown
     return reached
+
+
+def fewest_steps(nexts: NDArray[np.int64], goals: NDArray[np.int64]) -> NDArray[np.float32]:
+    """The length of the shortest path from each state to each goal.
+
+    :param nexts: the state that each action leads to, (n_states, n_actions)
+    :param goals: states, (n_goals,)
+    :return: (n_states, n_goals); infinity where there is no path
+    """
+    steps = np.full((len(nexts), len(goals)), np.inf, dtype=np.float32)
+    steps[goals, np.arange(len(goals))] = 0.0
+    while True:
+        shorter = np.minimum(steps, steps[nexts].min(axis=1) + 1.0)
+        if np.array_equal(shorter, steps):
+            return steps
+        steps = shorter

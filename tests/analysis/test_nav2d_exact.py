@@ -24,6 +24,7 @@ from sb3_abisim.analysis.nav2d_exact import (
     profile,
     reachable,
     spearman,
+    step_profile,
 )
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.networks.paper import Nav2DEncoder
@@ -138,6 +139,15 @@ def test_base_encoder_agrees_with_the_metric_at_c_0(base, few_cells):
     assert comparison.map_correlation == pytest.approx(1.0, abs=3e-3)
     assert comparison.state_correlation == pytest.approx(1.0, abs=3e-3)
     assert comparison.profile_error == pytest.approx(0.0, abs=1e-4)
+    assert comparison.step_profile == pytest.approx(comparison.exact_step_profile, rel=1e-3)
+
+
+def test_the_step_profile_is_relative_to_the_mean_of_the_layout():
+    apart = np.abs(np.subtract.outer(np.arange(4), np.arange(4))).astype(np.float32)
+    found = step_profile([apart, 5 * apart], [apart, apart])
+    mean = (6 * 1 + 4 * 2 + 2 * 3) / 12
+    np.testing.assert_allclose(found[:3], np.array([1, 2, 3]) / mean)
+    assert np.isnan(found[3]), "nothing is four steps apart"
 
 
 def test_short_sighted_encoder_has_a_profile_error(base, few_cells):

@@ -4,8 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from benchmarks.nav2d_marks import N_AROUND, N_CELLS, RADIUS, steps_to_goal
-from sb3_abisim.envs.nav2d import GOAL, SIZE, next_cells
+from benchmarks.nav2d_marks import N_AROUND, N_CELLS, RADIUS
 
 
 @pytest.mark.parametrize("env_id", ["Nav2DNeighborhood-v0", "Nav2DGains-v0"])
@@ -14,15 +13,6 @@ def test_observations_are_those_of_the_space(env_id: str) -> None:
     observations = [env.reset(seed=1)[0], *(env.step(action)[0] for action in (0, 1, 2, 3))]
     assert all(observation in env.observation_space for observation in observations)
     assert env.spec.max_episode_steps == 50
-
-
-def test_steps_to_the_goal_go_around_a_wall() -> None:
-    obstacles = np.zeros((SIZE, SIZE), dtype=bool)
-    x, y = GOAL
-    obstacles[y - 1 : y + 2, x - 1] = True  # left of the goal
-    steps = steps_to_goal(next_cells(obstacles.ravel())).reshape(SIZE, SIZE)
-    assert steps[y, x] == 0 and steps[y, x + 3] == 3
-    assert steps[y, x - 2] == 6, "two up or down, two to the right, and back"
 
 
 def test_gains_are_what_a_move_changes() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_abisim.common.grids import flood_fill, pack, unpack
+from sb3_abisim.common.grids import fewest_steps, flood_fill, pack, unpack
 
 ROWS, STRIDE = 9, 13
 
@@ -60,3 +60,10 @@ def test_stopping_early_does_not_change_whether_a_cell_is_reached(seed: int) -> 
 def test_the_search_ends_where_it_is_told_to_stop() -> None:
     corridor = (1 << 10) - 1
     assert flood_fill(1, corridor, STRIDE, stop=1 << 3) == 0b1111
+
+
+def test_the_fewest_steps_go_around_what_is_one_way_and_are_infinite_without_a_path() -> None:
+    # 0 -> 1 -> 2 -> 0 in a circle; 3 leads to 0, and nothing leads to 3.
+    nexts = np.array([[1, 1], [2, 1], [0, 2], [0, 3]])
+    steps = fewest_steps(nexts, np.array([0, 3]))
+    np.testing.assert_array_equal(steps, [[0, np.inf], [2, np.inf], [1, np.inf], [1, 0]])
