@@ -1,7 +1,8 @@
 """What an encoder sees, as figures and numbers: ``sb3-abisim analyze COMMAND ...``.
 
 ``exact`` compares encoders of Nav2D with the exact action-bisimulation metric
-(:mod:`sb3_abisim.analysis.nav2d_exact`). Every other command is a figure of :mod:`sb3_abisim.analysis.figures`: a
+(:mod:`sb3_abisim.analysis.nav2d_exact`), ``readouts`` reads from them what an agent needs
+(:mod:`sb3_abisim.analysis.readouts`). Every other command is a figure of :mod:`sb3_abisim.analysis.figures`: a
 PNG, and its numbers as JSON. ``all`` makes every figure.
 """
 
@@ -13,7 +14,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sb3_abisim.analysis import probes
+from sb3_abisim.analysis import probes, readouts
 from sb3_abisim.analysis.figures import FIGURES, default_encoders, load_all, make_figure, make_sweep
 from sb3_abisim.analysis.nav2d_exact import BINS, EVAL_SEED, STEPS, ExactReference, check_nav2d
 from sb3_abisim.analysis.sweep import PAPER_C
@@ -163,13 +164,47 @@ def _exact_parser(name: str) -> argparse.ArgumentParser:
 
 
 def _exact(args: argparse.Namespace) -> None:
-    if args.output is not None:
-        args.output.parent.mkdir(parents=True, exist_ok=True)
+    _make_room(args.output)
     results = exact(args.encoders, args.base, args.c, args.env, args.n_layouts, args.seed)
     print(table(results))
-    if args.output is not None:
+    _write(results, args.output)
+
+
+def _readouts_parser(name: str) -> argparse.ArgumentParser:
+    parser = make_parser(
+        "analyze readouts",
+        "What an agent needs to find the goal of Nav2D, read from frozen embeddings by ridge regression.",
+        "analyze readouts Nav2D-v0/ssi Nav2D-v0/abisim -o readouts.json",
+    )
+    parser.add_argument("encoders", nargs="+", metavar="ENCODER", help="encoder files or names")
+    parser.add_argument("--env", default="Nav2D-v0", metavar="ID", help="an id of Nav2D (default: %(default)s)")
+    parser.add_argument(
+        "--n-layouts", type=int, default=readouts.N_LAYOUTS,
+        help="to learn from, and as many others to score (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=EVAL_SEED, help="of the first layout (default: %(default)s)")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the numbers there as JSON")
+    return parser
+
+
+def _readouts(args: argparse.Namespace) -> None:
+    check_nav2d(args.env)
+    _make_room(args.output)
+    results = readouts.compare(load_all(args.encoders, args.env), args.env, args.n_layouts, args.seed)
+    print(readouts.table(results))
+    _write(results, args.output)
+
+
+def _make_room(output: Path | None) -> None:
+    """Before minutes of computing."""
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _write(results: dict[str, Any], output: Path | None) -> None:
+    if output is not None:
         text = json.dumps(results, indent=1) + "\n"
-        write_atomic(args.output, lambda file: file.write(text.encode()))
+        write_atomic(output, lambda file: file.write(text.encode()))
 
 
 def _all_parser(name: str) -> argparse.ArgumentParser:
@@ -218,6 +253,7 @@ _Run = Callable[[argparse.Namespace], None]
 # Name: what it does, its parser and its function.
 COMMANDS: dict[str, tuple[str, Callable[[str], argparse.ArgumentParser], _Run]] = {
     "exact": ("compare encoders of Nav2D with the exact metric", _exact_parser, _exact),
+    "readouts": ("what an agent needs on Nav2D, read from embeddings", _readouts_parser, _readouts),
     **{name: (one.help, _figure_parser, _figure) for name, one in FIGURES.items()},
     "sweep": ("perturbation maps on Nav2D over c, beside those of the exact metric", _sweep_parser, _sweep),
     "all": ("every figure, with the default encoders", _all_parser, _all),
