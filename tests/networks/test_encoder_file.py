@@ -242,6 +242,7 @@ def test_malformed_header(tmp_path: Path, header: bytes) -> None:
         (b"1", r"is damaged or not an encoder file \(the header is not a JSON object\); copy it again"),
         (b"{}", "has no valid hash: not an encoder file, or damaged; copy it again"),
     ],
+    ids=["none", "a number", "no hash"],
 )
 def test_the_smallest_headers(tmp_path: Path, header: bytes, message: str) -> None:
     (tmp_path / "e").write_bytes(len(header).to_bytes(8, "little") + header)

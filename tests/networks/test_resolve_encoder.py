@@ -35,7 +35,10 @@ def test_resolve_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (here / "Nav2D-v0").mkdir()
     (here / "Nav2D-v0" / "ssi").touch()
     assert resolve_encoder("Nav2D-v0/ssi") == here / "Nav2D-v0" / "ssi"
-    with pytest.raises(ValueError, match="^encoder must be a path, the name of a shipped encoder or hf://owner/repository/file, got ''$"):
+    with pytest.raises(
+        ValueError,
+        match=r"^encoder must be a path, the name of a shipped encoder or hf://owner/repository/file, got ''$",
+    ):
         resolve_encoder("")
 
 
