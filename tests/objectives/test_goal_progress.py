@@ -278,7 +278,8 @@ def test_it_begins_with_the_layers_that_the_base_has() -> None:
 def test_the_given_base_is_left_as_it_was() -> None:
     base = LineEncoder()
     objective = GoalProgress(LineEncoder(), DISCRETE, base, warm_start=False)
-    for module, frozen in ((base, False), (objective.base_encoder, True), (objective.target_head, True)):
+    copies = (objective.base_encoder, objective.target_encoder, objective.target_head)
+    for module, frozen in ((base, False), *((module, True) for module in copies)):
         assert {not parameter.requires_grad for parameter in module.parameters()} == {frozen}
     with th.no_grad():
         next(base.parameters()).zero_()
