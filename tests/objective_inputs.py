@@ -46,6 +46,21 @@ def make_batch(action_space, n=256, seed=0, noise=0.0):
     return TensorBatch.of(s, actions, s_next)
 
 
+def hidden_dims(head: nn.Module) -> list[int]:
+    """Sizes of the layers of a head but for the last."""
+    return [layer.out_features for layer in head.modules() if isinstance(layer, nn.Linear)][:-1]
+
+
+def loss_without_values(objective: Objective, batch: TensorBatch) -> set[str]:
+    """Devices of the loss and its terms for inputs on the device "meta".
+
+    Such tensors have no values, but mixing them with others of a dimension or more fails as on a GPU.
+    """
+    obs, actions, next_obs = (tensor.to("meta") for tensor in (batch.obs, batch.actions, batch.next_obs))
+    loss, terms = objective.to("meta").loss(TensorBatch.of(obs, actions, next_obs))
+    return {tensor.device.type for tensor in (loss, *terms.values())}
+
+
 def fit(objective: Objective, batch: TensorBatch, n_updates: int = 250) -> Objective:
     optimizer = th.optim.Adam(objective.parameters(), lr=5e-3)
     for _ in range(n_updates):

@@ -319,7 +319,7 @@ def _verify_hash(path: Path, data: bytes, header: dict[str, Any]) -> str:
         start, stop = (8 + int.from_bytes(data[:8], "little") + int(offset) for offset in (start, stop))
         stored = data[start:stop]
         if entry["dtype"] != "U8" or len(stored) != _HASH_BYTES:
-            raise ValueError("the hash has another size")
+            raise ValueError
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise EncoderFileError(f"{path} has no valid hash: not an encoder file, or damaged; {_REMEDY}") from error
     actual = hashlib.sha256(data[:start] + bytes(_HASH_BYTES) + data[stop:])

@@ -218,15 +218,13 @@ class ActionBisimulation(Objective):
         with th.no_grad():
             phi_next = self.target_encoder(batch.next_obs)
         terms: dict[str, th.Tensor] = {}
-        forward_loss = th.zeros((), device=phi.device)
         if self.forward_model is None:
             next_distance = l1_distance(phi_next[i], phi_next[j])
         else:
             with th.no_grad():
                 phi_target = self.target_encoder(batch.obs)
                 next_distance = self._expected_w1(phi_target, i, j)
-            forward_loss = self.forward_model.nll(phi_target, self.action_inputs(batch.actions), phi_next)
-            terms["forward_nll"] = forward_loss
+            terms["forward_nll"] = self.forward_model.nll(phi_target, self.action_inputs(batch.actions), phi_next)
         base_distance = l1_distance(psi[i], psi[j])
         target = action_bisim_target(base_distance, next_distance, self.c)
         # Unlike phi[i], the gradient of index_select adds up in a fixed order on several threads, too.
@@ -235,7 +233,7 @@ class ActionBisimulation(Objective):
         metric_loss = LOSSES[self.distance_loss](scale * distance, scale * target)
         l1_norm = phi.abs().sum(dim=1).mean()
         terms |= {"metric_loss": metric_loss, "distance": distance.mean(), "target": target.mean(), "l1_norm": l1_norm}
-        loss = metric_loss + self.l1_penalty * l1_norm + forward_loss
+        loss = metric_loss + self.l1_penalty * l1_norm + terms.get("forward_nll", 0.0)
         return loss, {name: term.detach() for name, term in terms.items()}
 
     def _sample_pairs(self, actions: th.Tensor, psi: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

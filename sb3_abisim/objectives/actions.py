@@ -249,7 +249,7 @@ class BoxActions(Actions):
         log_std = log_std.clamp(*_LOG_STD_RANGE)
         log_prob = th.distributions.Normal(mean, log_std.exp()).log_prob(actions).sum(dim=1)  # type: ignore[no-untyped-call]
         unexplained = (mean - actions).pow(2).sum() / (actions - actions.mean(dim=0)).pow(2).sum()
-        return log_prob, (1.0 - unexplained).clamp(0.0, 1.0).detach()
+        return log_prob, (1.0 - unexplained).clamp_min(0.0).detach()
 
     def sample(self, n: int, device: th.device) -> th.Tensor:
         """See :meth:`Actions.sample`."""

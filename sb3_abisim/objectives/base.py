@@ -32,7 +32,6 @@ class Objective(nn.Module):
         super().__init__()
         self.actions = actions_of(action_space)
         self.encoder = encoder
-        self.action_space = action_space
 
     @classmethod
     def check_k(cls, k: int | list[int]) -> None:

@@ -55,12 +55,12 @@ def value_targets(next_values: th.Tensor, gamma: float) -> th.Tensor:
 def progress_targets(values: th.Tensor, next_values: th.Tensor, gamma: float) -> th.Tensor:
     """``(log V(s', g) - log V(s, g)) / log(1 / gamma)``, steps towards each goal, clipped to -1..1.
 
-    :param values: V(s, g) of the target network, (batch, n_goals)
+    :param values: V(s, g) of the target network, (batch, n_goals), in 0..1
     :param next_values: V(s', g), likewise
     :param gamma: discount, in (0, 1)
     """
     least = gamma**HORIZON
-    steps = (next_values.clamp(least, 1.0).log() - values.clamp(least, 1.0).log()) / -math.log(gamma)
+    steps = (next_values.clamp_min(least).log() - values.clamp_min(least).log()) / -math.log(gamma)
     return steps.clamp(-1.0, 1.0)
 
 

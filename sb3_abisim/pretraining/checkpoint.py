@@ -42,8 +42,7 @@ class Checkpoints:
         path = self.folder / f"checkpoint-{n_updates:09d}.safetensors"
         metadata = {"n_updates": n_updates, "settings": self.settings, "rows": rows}
         _write(path, module, optimizer, metadata)
-        for old in self._paths()[:-N_KEPT]:
-            old.unlink()
+        self.remove(keep=N_KEPT)
 
     def restore(self, module: nn.Module, optimizer: th.optim.Optimizer) -> tuple[int, list[dict[str, float]]]:
         """Put the newest checkpoint, if there is one, back into a module, its optimizer and the random state.
@@ -60,13 +59,12 @@ class Checkpoints:
         rows = [{current_term(name): value for name, value in row.items()} for row in metadata["rows"]]
         return metadata["n_updates"], rows
 
-    def remove(self, keep: int = 0) -> None:
+    def remove(self, keep: int) -> None:
         """Remove them: only an unfinished run needs them, or one that is to get more updates.
 
         :param keep: how many of the newest ones stay
         """
-        paths = self._paths()
-        for path in paths[: len(paths) - keep]:
+        for path in self._paths()[::-1][keep:]:
             path.unlink()
 
     def exist(self) -> bool:
@@ -140,7 +138,7 @@ def _read(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, settings
     state: dict[int, dict[str, th.Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimizer."):
-            _, index, key = name.split(".", 2)
+            _, index, key = name.split(".")
             state.setdefault(int(index), {})[key] = tensor
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     th.set_rng_state(tensors["rng"])

@@ -1,6 +1,7 @@
 """The exact metric: by hand, the paper's theorems on random MDPs, and both transition paths against each other."""
 
 import itertools
+import sys
 
 import numpy as np
 import pytest
@@ -146,6 +147,21 @@ def test_ends_where_the_tolerance_is_finer_than_the_floats() -> None:
     metric = action_bisim_metric(BASE.astype(np.float32), THREE, c=0.99, tol=1e-12)
     np.testing.assert_allclose(metric, action_bisim_metric(BASE, THREE, c=0.99, tol=1e-12), rtol=1e-5)
     assert metric.dtype == np.float32
+
+
+def test_probabilities_that_add_up_to_one_but_for_rounding() -> None:
+    probs = np.eye(3)[THREE]
+    probs[0, 0] *= 1 + 8e-6
+    exact = action_bisim_metric(BASE, np.eye(3)[THREE], c=0.5)
+    np.testing.assert_allclose(action_bisim_metric(BASE, probs, c=0.5), exact, atol=1e-4)
+
+
+def test_probabilities_need_pot(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ot", None)
+    remedy = r"^stochastic transitions need POT: pip install 'sb3_abisim\[analysis\]'$"
+    with pytest.raises(ImportError, match=remedy):
+        action_bisim_metric(BASE, np.eye(3)[THREE])
+    action_bisim_metric(BASE, THREE)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import index_env
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ import sb3_abisim.data.dataset as dataset_module
 from sb3_abisim.common.spaces import space_from_json, space_to_json
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED, is_shard_file
-from sb3_abisim.data.writer import Segment, open_writer
+from sb3_abisim.data.writer import Segment, open_writer, write_dataset
 
 
 @pytest.fixture(scope="module")
@@ -153,19 +154,25 @@ def test_pages_that_were_read_are_given_back(
     maps = [i for i, line in enumerate(lines) if "frames-00000.npy" in line and str(dataset.path) in line]
     resident = [int(line.split()[1]) for i in maps for line in lines[i : i + 6] if line.startswith("Rss:")]
     assert len(resident) > 0 and (sum(resident) > 0) == stays
+    assert stays or dataset._bytes_read == 0
     np.testing.assert_array_equal(dataset.frames(np.arange(dataset.n_frames)), frames)
 
 
 def test_pages_are_given_back_within_a_large_read(dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     row = dataset.frames(np.array([0])).nbytes
-    monkeypatch.setattr(dataset_module, "RELEASE_AFTER_BYTES", 50 * row)
+    monkeypatch.setattr(dataset_module, "RELEASE_AFTER_BYTES", 100 * row)
     times = []
     monkeypatch.setattr(
         dataset, "_release_pages", lambda: (times.append(dataset._bytes_read), setattr(dataset, "_bytes_read", 0))
     )
     dataset.frames(np.arange(dataset.n_frames))
     largest = max(shard["n_frames"] for shard in dataset.meta["shards"])
-    assert len(times) > 1 and all(50 * row < read <= (50 + largest) * row for read in times)
+    assert largest < 100, "several parts make up the limit"
+    assert len(times) > 1 and all(100 * row < read <= (100 + largest) * row for read in times)
+    times.clear()
+    monkeypatch.setattr(dataset, "_bytes_read", 0)
+    dataset.frames(np.arange(100) % 50)
+    assert times == [], "the limit itself is not beyond it"
 
 
 def test_too_large_k_names_the_longest_segment(dataset: TransitionDataset) -> None:
@@ -173,8 +180,9 @@ def test_too_large_k_names_the_longest_segment(dataset: TransitionDataset) -> No
         dataset.valid_starts(index_env.LIMIT + 1)
     with pytest.raises(ValueError, match="at least 1, got 0"):
         dataset.batches(4, k=0)
-    with pytest.raises(ValueError, match="chunk_length must be at least 1, got 0"):
-        dataset.batches(4, chunk_length=0)
+    for name, least in (("batch_size", 1), ("chunk_length", 1), ("start", 0)):
+        with pytest.raises(ValueError, match=f"^{name} must be at least {least}, got {least - 1}$"):
+            dataset.batches(**{"batch_size": 4, name: least - 1})
 
 
 def as_rows(batches: Iterator[dataset_module.TransitionBatch]) -> np.ndarray:
@@ -296,8 +304,10 @@ def test_splits_share_no_segment(folder: Path) -> None:
         TransitionDataset(folder, eval_fraction=0).valid_starts(split="eval")
 
 
-def test_pickle_holds_no_data(dataset: TransitionDataset) -> None:
+def test_pickle_holds_no_data(dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     sent = pickle.dumps(dataset)
+    # Nor does unpickling hash the files again.
+    monkeypatch.setattr(dataset_module, "file_hash", None)
     assert len(sent) < 1000
     again = pickle.loads(sent)
     assert (again.frames(np.arange(50)) == dataset.frames(np.arange(50))).all()
@@ -334,8 +344,6 @@ def test_reading_does_not_load_the_frames(tmp_path: Path) -> None:
 
 
 def test_spaces_survive_json() -> None:
-    import gymnasium as gym
-
     for space in (
         gym.spaces.Discrete(4, start=-2),
         gym.spaces.Box(0, 255, (3, 15, 15), np.uint8),
@@ -405,6 +413,77 @@ def test_all_chunks_but_those_at_the_ends_have_their_length(
             places.append((segment, int(offsets[0])))
     # Each pass cuts anew, and a segment's cut does not follow from its place in the dataset.
     assert len(set(places)) > len({segment for segment, _ in places})
+
+
+@pytest.mark.parametrize("chunk_length", [2, 5])
+def test_chunks_are_cut_and_permuted_as_ever(
+    dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch, chunk_length: int
+) -> None:
+    """Encoders follow from this order, too."""
+    monkeypatch.setattr(dataset, "_frames", lambda index: index)
+    ends, starts = dataset.ends, dataset.valid_starts()
+    generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([7, 3])))
+    before = generator.integers(chunk_length, size=np.count_nonzero(ends))
+    chunk_of, chunk, segment, step = [], 0, 0, 0
+    for end in ends:
+        chunk += step == 0 or (step + before[segment]) % chunk_length == 0
+        chunk_of.append(chunk)
+        step = step + 1 if end == INSIDE else 0
+        segment += end != INSIDE
+    rank = generator.permutation(max(chunk_of[t] for t in starts) + 1)
+    expected = sorted(starts.tolist(), key=lambda t: (rank[chunk_of[t]], t))
+    (batch,) = dataset.batches(len(starts), seed=7, epoch=3, chunk_length=chunk_length)
+    assert batch.obs.tolist() == expected
+    assert len(batch.frames) < 2 * len(starts), "frames are shared"
+
+
+def write_episodes(folder: Path, lengths: list[int]) -> Path:
+    """Episodes whose frames hold their number."""
+    segments = [
+        Segment(np.full((length + 1, 3, 4, 4), number, np.uint8), np.zeros(length, np.int64), TERMINATED)
+        for number, length in enumerate(lengths)
+    ]
+    space = gym.spaces.Box(0, 255, (3, 4, 4), np.uint8)
+    write_dataset(
+        folder,
+        segments,
+        env_id="My-v0",
+        observation_space=space,
+        action_space=gym.spaces.Discrete(2),
+        source="a test",
+    )
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("n_episodes", "fraction", "n_eval"),
+    [(1, 0.5, 0), (2, 0.9, 1), (2, 0.1, 1), (10, 0.0, 0), (10, 0.25, 2), (10, 0.26, 3), (40, 0.05, 2)],
+)
+def test_which_episodes_are_evaluated_on(tmp_path: Path, n_episodes: int, fraction: float, n_eval: int) -> None:
+    """A share of them, but one at least, and not all; which ones does not depend on the run."""
+    folder = write_episodes(tmp_path / "d", [2 + k % 3 for k in range(n_episodes)])
+    dataset = TransitionDataset(folder, eval_fraction=fraction)
+    chosen = np.random.Generator(np.random.PCG64(20240229)).permutation(n_episodes)[:n_eval].tolist()
+    for split, expected in (("eval", chosen), ("train", set(range(n_episodes)) - set(chosen))):
+        if expected:
+            frames = dataset.frames(dataset.valid_starts(split=split))  # type: ignore[arg-type]
+            assert set(frames[:, 0, 0, 0].tolist()) == set(expected)
+        else:
+            with pytest.raises(ValueError, match=f"no transition of 1 steps in split '{split}'"):
+                dataset.valid_starts(split=split)  # type: ignore[arg-type]
+
+
+def test_the_only_transition(tmp_path: Path) -> None:
+    dataset = TransitionDataset(write_episodes(tmp_path / "d", [1]), eval_fraction=0)
+    (batch,) = dataset.batches(1, sequences=True)
+    assert batch.actions.shape == (1, 1)
+
+
+def test_what_is_in_memory_per_frame(dataset: TransitionDataset) -> None:
+    """Five bytes and an action, and something per segment."""
+    arrays = [value for value in vars(dataset).values() if isinstance(value, np.ndarray)]
+    per_frame = [array for array in arrays if len(array) == dataset.n_frames]
+    assert sum(array.nbytes for array in per_frame) == dataset.n_frames * (5 + dataset.actions([0]).nbytes)
 
 
 def test_what_is_out_of_range_is_named(dataset: TransitionDataset) -> None:

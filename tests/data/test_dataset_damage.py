@@ -4,14 +4,18 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from dataset_inputs import collect_index, rewrite_meta, without_hashes
 
 import sb3_abisim.data.dataset as dataset_module
+from sb3_abisim.common.files import file_hash
 from sb3_abisim.data.dataset import TransitionDataset
-from sb3_abisim.data.format import HASH_KEY, META_NAME, DatasetError, make_meta
+from sb3_abisim.data.format import CUT, HASH_KEY, INSIDE, META_NAME, TERMINATED, DatasetError, make_meta
+
+CHAINED = {"format_version": 3, "shards_per_chain": 1}
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +75,29 @@ def test_large_datasets_are_hashed_on_request_only(copy: Path, monkeypatch: pyte
         TransitionDataset(copy, verify=True)
 
 
+def test_datasets_below_the_limit_are_hashed(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    meta = json.loads((copy / META_NAME).read_bytes())
+    size = sum(entry["bytes"] for shard in meta["shards"] for entry in shard["files"].values())
+    hashed: list[Path] = []
+    monkeypatch.setattr(dataset_module, "file_hash", lambda path: hashed.append(path) or file_hash(path))
+    for limit, n_hashed in ((size, 0), (size + 1, 9 * 6)):
+        monkeypatch.setattr(dataset_module, "VERIFY_BELOW_BYTES", limit)
+        TransitionDataset(copy)
+        assert len(hashed) == n_hashed
+
+
+def test_a_damaged_copy_is_not_taken_for_the_original(folder: Path, copy: Path) -> None:
+    """Size, time and the hash that it should have are those of a file that this process has found right."""
+    TransitionDataset(folder)
+    path = copy / "frames-00002.npy"
+    status, damaged = path.stat(), bytearray(path.read_bytes())
+    damaged[-1] ^= 1
+    path.write_bytes(damaged)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    with pytest.raises(DatasetError, match=r"frames-00002\.npy is damaged"):
+        TransitionDataset(copy)
+
+
 def test_a_process_hashes_a_file_once_unless_it_changed(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hashed = []
     real = dataset_module.file_hash
@@ -95,6 +122,58 @@ def test_a_pickle_in_place_of_an_array_is_not_run(copy: Path, tmp_path: Path) ->
     with pytest.raises(DatasetError, match=r"actions-00000\.npy is not an array file of a dataset"):
         TransitionDataset(copy)
     assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "held"),
+    [(lambda a: a.astype(np.int32), r"int32 \((\d+),\)"), (lambda a: np.stack([a, a], axis=1), r"int64 \(\d+, 2\)")],
+    ids=["type", "shape"],
+)
+def test_arrays_of_another_type_or_shape_are_refused(copy: Path, change: Any, held: str) -> None:
+    path = copy / "actions-00001.npy"
+    np.save(path, change(np.load(path)))
+    rewrite_meta(copy, json.loads((copy / META_NAME).read_bytes()))
+    with pytest.raises(DatasetError, match=rf"actions-00001\.npy holds {held}, its manifest says <?int64 \(\d+,\)"):
+        TransitionDataset(copy)
+
+
+@pytest.mark.parametrize("shard", [0, 8])
+@pytest.mark.parametrize("harm", ["one more", "unknown", "moved"])
+def test_ends_that_contradict_the_manifest_are_refused(copy: Path, harm: str, shard: int) -> None:
+    path = copy / f"ends-0000{shard}.npy"
+    ends = np.load(path)
+    if harm != "unknown":
+        ends[np.flatnonzero(ends == INSIDE)[0]] = TERMINATED
+    if harm != "one more":
+        ends[-1] = CUT + 1 if harm == "unknown" else INSIDE
+    np.save(path, ends)
+    rewrite_meta(copy, json.loads((copy / META_NAME).read_bytes()))
+    with pytest.raises(DatasetError, match=f"the episode ends of {copy} contradict its meta.json; it is damaged or"):
+        TransitionDataset(copy)
+
+
+@pytest.mark.parametrize(
+    ("changes", "remedy"),
+    [
+        ({}, ""),
+        ({"env_kwargs": {"size": 3}}, " with its --env-kwargs"),
+        (CHAINED | {"preprocessing": {"frame_stack": 2}}, r" and its preprocessing, \{'frame_stack': 2\}"),
+    ],
+    ids=["plain", "arguments", "preprocessing"],
+)
+def test_the_remedy_is_the_command_that_collected(copy: Path, changes: dict[str, Any], remedy: str) -> None:
+    rewrite_meta(copy, {**json.loads((copy / META_NAME).read_bytes()), **changes})
+    (copy / "ends-00000.npy").unlink()
+    command = f"sb3-abisim collect --env IndexEnv-v0 -n 420 --seed 3 --n-envs 4 -o {copy}"
+    with pytest.raises(DatasetError, match=f"collects damaged shards anew: {command}{remedy}$"):
+        TransitionDataset(copy)
+
+
+def test_a_document_that_is_no_manifest_names_the_remedy(copy: Path) -> None:
+    (copy / META_NAME).write_text("[]")
+    remedy = "run the command that made the dataset again, in a new folder if it refuses"
+    with pytest.raises(DatasetError, match=f"{META_NAME} is damaged, or not that of a dataset: .*; {remedy}$"):
+        TransitionDataset(copy)
 
 
 def test_a_forged_manifest_does_not_lead_out_of_the_folder(copy: Path) -> None:

@@ -16,9 +16,17 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_abisim import registry
+from sb3_abisim._version import __version__
 from sb3_abisim.common.cli import import_packages
+from sb3_abisim.networks import encoder_file
 from sb3_abisim.networks.base import Encoder, make_encoder
-from sb3_abisim.networks.encoder_file import REFERENCE_TOLERANCE, EncoderFileError, load_encoder, save_encoder
+from sb3_abisim.networks.encoder_file import (
+    REFERENCE_TOLERANCE,
+    EncoderFileError,
+    load_encoder,
+    reference_batch,
+    save_encoder,
+)
 
 SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
 ACTIONS = spaces.Box(np.array([-1, -2], np.float32), np.array([3, 4], np.float32))
@@ -77,10 +85,12 @@ def test_round_trip(tmp_path: Path) -> None:
     hash = save(tmp_path / "e.safetensors", encoder)
     file = load_encoder(str(tmp_path / "e.safetensors"))
     assert (file.path, file.hash) == (tmp_path / "e.safetensors", hash)
-    assert file.encoder.spec() == encoder.spec() and not file.encoder.training
+    assert file.encoder.spec() == encoder.spec() and not file.encoder.training and file.encoder.is_pretrained
     for name, weight in encoder.state_dict().items():
         assert th.equal(file.encoder.state_dict()[name], weight), name
     versions = file.metadata.pop("versions")
+    assert versions.keys() == {"sb3_abisim", "torch", "stable_baselines3", "gymnasium", "safetensors", "numpy"}
+    assert versions["sb3_abisim"] == __version__
     assert versions["torch"] == th.__version__.split("+")[0] or versions["torch"] == th.__version__
     assert file.metadata == {
         "preprocessing": {},
@@ -107,6 +117,8 @@ def test_reference_batch_is_what_the_network_makes_of_images_over_255(path: Path
     with th.no_grad():
         expected = seeded_encoder()(th.from_numpy(FRAMES).float() / 255)
     assert th.allclose(tensors["golden.embeddings"], expected, rtol=0, atol=1e-6)
+    observations, embeddings = reference_batch(load_encoder(path))
+    assert np.array_equal(observations, FRAMES) and np.array_equal(embeddings, tensors["golden.embeddings"].numpy())
 
 
 def test_hash_is_sha256_with_its_bytes_blank(path: Path) -> None:
@@ -138,6 +150,10 @@ def test_same_arguments_same_bytes(tmp_path: Path) -> None:
     assert len({(tmp_path / f"{i}").read_bytes() for i in range(10)}) == 1
     assert save(tmp_path / "other", seeded_encoder(1)) != save(tmp_path / "0")
     assert save(tmp_path / "other", settings={"beta": 0.25}) != save(tmp_path / "0")
+    hash = save(tmp_path / "other", settings={"beta": 0.5, "c": 1})
+    assert save(tmp_path / "other", settings={"c": 1, "beta": 0.5}) == hash, "the order of settings means nothing"
+    hash = save(tmp_path / "other")
+    assert save(tmp_path / "other", reference_observations=np.asfortranarray(FRAMES)) == hash
 
 
 def test_saving_and_loading_leave_encoder_and_random_state_alone(tmp_path: Path) -> None:
@@ -145,7 +161,7 @@ def test_saving_and_loading_leave_encoder_and_random_state_alone(tmp_path: Path)
     before = th.get_rng_state()
     save(tmp_path / "e", encoder)
     load_encoder(tmp_path / "e")
-    assert encoder.training and th.equal(th.get_rng_state(), before)
+    assert all(module.training for module in encoder.modules()) and th.equal(th.get_rng_state(), before)
 
 
 def test_no_flipped_bit_loads(path: Path) -> None:
@@ -190,10 +206,12 @@ class Payload:
 def test_pickle_is_not_executed(tmp_path: Path) -> None:
     marker = tmp_path / "marker"
     (tmp_path / "e.safetensors").write_bytes(pickle.dumps(Payload(marker)))
-    with pytest.raises(EncoderFileError, match="pickle"):
+    pickle_message = r"/e\.safetensors is a pickle, which is never read, not an encoder file \(.*\); copy it again"
+    with pytest.raises(EncoderFileError, match=pickle_message):
         load_encoder(tmp_path / "e.safetensors")
     th.save(Payload(marker), tmp_path / "f.safetensors")
-    with pytest.raises(EncoderFileError, match="zip"):
+    zip_message = r"/f\.safetensors is a zip archive \(a saved SB3 model, or a torch file\), not an encoder file \("
+    with pytest.raises(EncoderFileError, match=zip_message):
         load_encoder(tmp_path / "f.safetensors")
     assert not marker.exists()
 
@@ -215,6 +233,68 @@ def test_malformed_header(tmp_path: Path, header: bytes) -> None:
     (tmp_path / "e").write_bytes(len(header).to_bytes(8, "little") + header)
     with pytest.raises(EncoderFileError, match="again"):
         load_encoder(tmp_path / "e")
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        (b"", r"is damaged or not an encoder file \(no header of a safetensors file, or cut short\); copy it again"),
+        (b"1", r"is damaged or not an encoder file \(the header is not a JSON object\); copy it again"),
+        (b"{}", "has no valid hash: not an encoder file, or damaged; copy it again"),
+    ],
+    ids=["none", "a number", "no hash"],
+)
+def test_the_smallest_headers(tmp_path: Path, header: bytes, message: str) -> None:
+    (tmp_path / "e").write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(EncoderFileError, match=f"/e {message}"):
+        load_encoder(tmp_path / "e")
+
+
+def test_a_hash_of_another_type_is_none(path: Path) -> None:
+    data = path.read_bytes()
+    at = data.index(b'"digest":')
+    forged = data[:at] + data[at:].replace(b'"dtype":"U8"', b'"dtype":"I8"', 1)
+    path.write_bytes(forged)
+    with pytest.raises(EncoderFileError, match="has no valid hash"):
+        load_encoder(path)
+
+
+def test_a_file_of_the_largest_size_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    size = path.stat().st_size
+    monkeypatch.setattr(encoder_file, "MAX_FILE_BYTES", size)
+    load_encoder(path)
+    monkeypatch.setattr(encoder_file, "MAX_FILE_BYTES", size - 1)
+    with pytest.raises(EncoderFileError, match=f"{path} has {size} bytes, more than {size - 1}; not an encoder file"):
+        load_encoder(path)
+
+
+def test_preprocessing_and_an_unknown_action_space(path: Path) -> None:
+    assert b"preprocessing" not in path.read_bytes(), "as in files of before"
+    save(path, preprocessing={"frame_stack": 4}, action_space=None)
+    file = load_encoder(path)
+    assert file.metadata["preprocessing"] == {"frame_stack": 4} and file.metadata["action_space"] is None
+    file.check(SPACE, spaces.Discrete(4))
+
+
+def test_arguments_of_a_network_that_is_no_default(tmp_path: Path) -> None:
+    th.manual_seed(0)
+    encoder = make_encoder(SPACE, "small", features_dim=7)
+    save(tmp_path / "e", encoder)
+    again = load_encoder(tmp_path / "e", network="small").encoder
+    assert again.spec() == encoder.spec() and again.features_dim == 7
+
+
+def test_a_network_that_cannot_be_built_without_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def factory(space: spaces.Box) -> th.nn.Module:
+        if th.zeros(1).is_meta:
+            raise ValueError("needs values")
+        return th.nn.Sequential(th.nn.Flatten(), th.nn.Linear(675, 2))
+
+    registry.networks()
+    monkeypatch.setattr(registry._NETWORKS, "by_name", dict(registry._NETWORKS.by_name))
+    registry.register_network("valued", factory)
+    save(tmp_path / "e", make_encoder(SPACE, "valued"))
+    assert load_encoder(tmp_path / "e").encoder.spec()["name"] == "valued"
 
 
 def test_a_forged_but_harmless_file_loads(path: Path) -> None:
@@ -246,16 +326,23 @@ def test_network_from_the_file_is_validated(path: Path, network: Any) -> None:
         load_encoder(path)
 
 
+@pytest.mark.parametrize("network", [{"name": None, "kwargs": {}}, {"name": "Nav2DEncoder", "kwargs": []}])
+def test_a_network_is_a_name_with_arguments(path: Path, network: Any) -> None:
+    forge(path, lambda tensors, document: document.update(network=network))
+    with pytest.raises(EncoderFileError, match=r"network must be a name with keyword arguments, got \{.*'name': "):
+        load_encoder(path)
+
+
 @pytest.mark.parametrize(
     ("name", "kwargs"),
     [("system", {}), ("os.system", {"command": "true"}), ("os:system", {"command": "true"}), ("__class__", {})],
 )
 def test_a_network_that_is_not_registered_is_refused(path: Path, name: str, kwargs: dict[str, Any]) -> None:
     forge(path, lambda tensors, document: document.update(network={"name": name, "kwargs": kwargs}))
-    message = "is not registered; .*Nav2DEncoder.*--packages"
+    message = r"is not registered; known are (\w+, )*Nav2DEncoder, .* If you trust the .* command line, or import it$"
     if ":" in name:
         message = f"is imported only if you name it.*--packages {name} .*network='{name}'"
-    with pytest.raises(EncoderFileError, match=rf"network '{name}', which {message}"):
+    with pytest.raises(EncoderFileError, match=rf"{path} names the network '{name}', which {message}"):
         load_encoder(path)
 
 
@@ -352,6 +439,12 @@ def test_tensors_that_do_not_fit(path: Path, name: str, value: th.Tensor) -> Non
         load_encoder(path)
 
 
+def test_reference_observations_of_another_space(path: Path) -> None:
+    forge(path, lambda tensors, document: document["contract"]["observation_space"].update(shape=[3, 15, 16]))
+    with pytest.raises(EncoderFileError, match=r"reference batch \(5, 3, 15, 15\) is not of \{.*\[3, 15, 16\]"):
+        load_encoder(path)
+
+
 def raw_embeddings(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> None:
     """As if pretraining had not divided observations by 255."""
     with th.no_grad():
@@ -370,7 +463,7 @@ def raw_embeddings(tensors: dict[str, th.Tensor], document: dict[str, Any]) -> N
 )
 def test_reference_batch_that_does_not_agree(path: Path, edit: Callable[..., object]) -> None:
     forge(path, edit)
-    with pytest.raises(EncoderFileError, match="reference batch differently"):
+    with pytest.raises(EncoderFileError, match=f"{path}: the network embeds the reference batch differently"):
         load_encoder(path)
 
 
@@ -414,7 +507,7 @@ def test_check_prints_both_sides(path: Path) -> None:
     file = load_encoder(path)
     file.check(SPACE, ACTIONS)
     file.check(SPACE)
-    with pytest.raises(ValueError, match=r"\[3, 15, 15\].*\[3, 16, 15\]"):
+    with pytest.raises(ValueError, match=r"on Nav2D-v0 with .*\[3, 15, 15\].*\[3, 16, 15\].*; use an encoder"):
         file.check(spaces.Box(0, 255, (3, 16, 15), np.uint8))
     with pytest.raises(ValueError, match=r"'high': 255.*'high': 254"):
         file.check(spaces.Box(0, 254, (3, 15, 15), np.uint8))

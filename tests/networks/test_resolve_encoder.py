@@ -20,12 +20,25 @@ def test_resolve_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert resolve_encoder("Nav2D-v0/ssi") == shipped / "Nav2D-v0" / "ssi.safetensors"
     with pytest.raises(EncoderNotFoundError) as raised:
         resolve_encoder("Nav2D-v0/abisim")
-    for part in (here / "Nav2D-v0/abisim", shipped / "Nav2D-v0/abisim.safetensors", "Shipped encoders: Nav2D-v0/ssi."):
-        assert str(part) in str(raised.value)
+    name = "Nav2D-v0/abisim"
+    assert str(raised.value) == (
+        f"no encoder file '{name}'; searched {here / name}, {shipped / name}, {shipped / name}.safetensors. Shipped "
+        "encoders: Nav2D-v0/ssi. Correct the name, or write the file with sb3-abisim pretrain"
+    )
+    (shipped / "Nav2D-v0" / "acro.safetensors").touch()
+    with pytest.raises(EncoderNotFoundError, match=r"Shipped encoders: Nav2D-v0/acro, Nav2D-v0/ssi\. "):
+        resolve_encoder(name)
+    monkeypatch.setattr(encoder_file, "resource_path", lambda kind: here)
+    with pytest.raises(EncoderNotFoundError, match=r"Shipped encoders: none\. "):
+        resolve_encoder(name)
+    monkeypatch.setattr(encoder_file, "resource_path", lambda kind: shipped)
     (here / "Nav2D-v0").mkdir()
     (here / "Nav2D-v0" / "ssi").touch()
     assert resolve_encoder("Nav2D-v0/ssi") == here / "Nav2D-v0" / "ssi"
-    with pytest.raises(ValueError, match="''"):
+    with pytest.raises(
+        ValueError,
+        match=r"^encoder must be a path, the name of a shipped encoder or hf://owner/repository/file, got ''$",
+    ):
         resolve_encoder("")
 
 

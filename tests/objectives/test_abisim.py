@@ -9,7 +9,7 @@ import torch as th
 from objective_inputs import LineEncoder, change_weights
 from torch import nn
 
-from sb3_abisim.objectives.abisim import ActionBisimulation, action_bisim_target
+from sb3_abisim.objectives.abisim import ActionBisimulation, ForwardModel, action_bisim_target
 from sb3_abisim.objectives.base import TensorBatch
 
 DISCRETE = gym.spaces.Discrete(2)
@@ -48,15 +48,19 @@ def test_behavior_loss_equals_loop():
     phi = objective.encoder(batch.obs)
     psi = objective.base_encoder(batch.obs)
     phi_next = objective.target_encoder(batch.next_obs)
-    errors = []
+    errors, distances, targets = [], [], []
     for i in range(6):
         for j in range(6):
             if i != j and batch.actions[i] == batch.actions[j]:
                 target = 0.3 * l1(psi[i], psi[j]) + 0.7 * l1(phi_next[i], phi_next[j])
-                errors.append((l1(phi[i], phi[j]) - target) ** 2)
+                distances.append(l1(phi[i], phi[j])), targets.append(target)
+                errors.append((distances[-1] - target) ** 2)
     assert 0 < len(errors) < 30, "the batch must hold pairs of both kinds"
     norm = sum(l1(phi[i], th.zeros(3)) for i in range(6)) / 6
-    assert float(objective.loss(batch)[0]) == pytest.approx(sum(errors) / len(errors) + 0.2 * norm, rel=1e-4)
+    loss, terms = objective.loss(batch)
+    assert float(loss) == pytest.approx(sum(errors) / len(errors) + 0.2 * norm, rel=1e-4)
+    means = {"metric_loss": np.mean(errors), "distance": np.mean(distances), "target": np.mean(targets)}
+    assert {name: float(term) for name, term in terms.items()} == pytest.approx({**means, "l1_norm": norm}, rel=1e-4)
 
 
 @th.no_grad()
@@ -93,6 +97,28 @@ def test_forward_nll_equals_loop():
     assert float(objective.loss(batch)[1]["forward_nll"]) == pytest.approx(total / 18, rel=1e-4)
 
 
+@th.no_grad()
+def test_the_forward_model_predicts_a_change():
+    model = ForwardModel(3, 2)
+    last = model.network[-1]
+    last.weight.zero_()
+    last.bias.copy_(th.tensor([0.5, -1.0, 2.0, 0.25, -9.0, 9.0]))
+    phi = th.rand(4, 3)
+    mean, std = model(phi, th.rand(4, 2))
+    assert th.equal(mean, phi + th.tensor([0.5, -1.0, 2.0]))
+    assert th.allclose(std, th.tensor([0.25, -5.0, 2.0]).exp().expand(4, 3))
+
+
+def test_pairs_and_expected_distances_stay_on_the_device_of_their_inputs(monkeypatch):
+    """Tensors of the device "meta" have no values, but mixing them with others fails as on a GPU."""
+    objective, meta = make().to("meta"), th.device("meta")
+    monkeypatch.setattr(th.Tensor, "nonzero", lambda self: th.zeros(9, 2, dtype=th.int64, device=self.device))
+    i, j = objective._sample_pairs(th.zeros(4, dtype=th.int64, device=meta), th.rand(4, 5, device=meta))
+    assert i.device == j.device == meta
+    index = th.zeros(3, dtype=th.int64, device=meta)
+    assert objective._expected_w1(th.rand(4, 3, device=meta), index, index).device == meta
+
+
 def test_pairs_are_different_transitions_with_the_same_action():
     objective, actions = make(expectation="behavior", n_pairs=5), th.tensor([0, 1, 0, 1, 1, 0, 0])
     seen = set()
@@ -127,6 +153,14 @@ def test_loss_of_nearest_pairs_equals_loop():
         errors.append(mean / (base + 0.05 * mean) * abs(l1(phi[i], phi[j]) - target))
     th.manual_seed(5)
     assert float(objective.loss(batch)[0]) == pytest.approx(sum(errors) / 10, rel=1e-4)
+
+
+def test_nearest_is_by_the_l1_norm():
+    """The first two are nearest in the L2 norm, the last two in the L1 norm."""
+    psi = th.tensor([[0.0, 0, 0], [0.6, 0.6, 0.6], [9.0, 0, 0], [10.1, 0, 0]])
+    objective = make(pairs="nearest", n_pairs=2)
+    i, j = objective._sample_pairs(th.zeros(4, dtype=th.int64), psi)
+    assert (int(i[0]), int(j[0])) == (2, 3)
 
 
 @th.no_grad()
@@ -191,6 +225,32 @@ def test_warm_start_copies_the_base():
         make(warm_start=True)
 
 
+def test_the_given_base_is_left_as_it_was():
+    base = LineEncoder(5)
+    objective = ActionBisimulation(LineEncoder(3), DISCRETE, base)
+    assert all(parameter.requires_grad for parameter in base.parameters())
+    assert objective.base_encoder.layers is not base.layers
+
+
+def test_settings_that_nobody_gives():
+    objective = ActionBisimulation(LineEncoder(3), DISCRETE, LineEncoder(5))
+    names = ("c", "tau", "expectation", "distance_loss", "l1_penalty", "pairs", "n_pairs", "n_action_samples")
+    expected = [0.9, 0.01, "uniform", "l1", 0.0, "random", 4096, 8]
+    assert [getattr(objective, name) for name in names] == expected
+    assert (objective.action_radius, objective.forward_reset_interval) == (0.2, None)
+    assert objective.n_updates.dtype == th.int64
+
+
+def test_the_least_and_the_most_of_each_setting():
+    objective = make(CONTINUOUS, c=0.0, tau=1.0, n_pairs=1, n_action_samples=1, forward_reset_interval=1)
+    objective.loss(make_batch(CONTINUOUS))[0].backward()
+    before = objective.forward_model.network[0].weight.clone()
+    objective.after_step()
+    assert not th.equal(objective.forward_model.network[0].weight, before)
+    for online, target in zip(objective.encoder.parameters(), objective.target_encoder.parameters(), strict=True):
+        assert th.equal(online, target)
+
+
 def chain():
     """Three states in a row; action 0 goes to the first, action 1 one to the right. psi sets the first apart by 1."""
     observations = th.zeros(3, 1, 1, 4)
@@ -238,9 +298,12 @@ def test_converges_to_the_metric_of_a_chain(expectation):
         ({"c": 1.0}, "c must lie"),
         ({"n_pairs": 0}, "n_pairs"),
         ({"n_pairs": 8.0}, "n_pairs must be a whole number of at least 1, got 8.0"),
+        ({"n_action_samples": 0}, "n_action_samples must be a whole number of at least 1, got 0"),
         ({"l1_penalty": math.nan}, "l1_penalty"),
+        ({"l1_penalty": math.inf}, "l1_penalty must be a number of at least 0, got inf"),
         ({"c": -0.1}, "c must lie"),
         ({"tau": 0.0}, "tau"),
+        ({"tau": 1.5}, "tau must lie in .*, got 1.5"),
         ({"expectation": "both"}, "expectation must be one of .*, got 'both'"),
         ({"distance_loss": "l3"}, "distance_loss must be one of .*, got 'l3'"),
         ({"pairs": "far"}, "pairs must be one of .*, got 'far'"),

@@ -23,5 +23,5 @@ def test_acro_is_the_same_loss_for_several_steps():
             InverseDynamics.check_k(k)
     InverseDynamics.check_k(1)
     for k in (1, [1, 1]):
-        with pytest.raises(ValueError, match="which is ssi"):
+        with pytest.raises(ValueError, match=r"^acro needs k > 1, got k = 1, which is ssi$"):
             ACRO.check_k(k)

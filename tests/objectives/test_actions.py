@@ -49,6 +49,19 @@ def test_shapes(kind):
     assert log_prob.shape == (5,) and accuracy.shape == ()
 
 
+@each_space
+def test_guessing_is_right_for_one_of_all_actions(kind):
+    counts = {"discrete": 3, "multi_discrete": 6, "multi_discrete_2d": 24, "multi_binary": 8, "multi_binary_2d": 16}
+    actions = actions_of(SPACES[kind])
+    assert actions.count == counts.get(kind, math.inf)
+    assert actions.chance == pytest.approx(1 / actions.count)
+
+
+def test_a_number_with_equal_bounds_is_zero():
+    space = gym.spaces.Box(np.float32([-1, 3]), np.float32([1, 3]))
+    assert actions_of(space).inputs(th.tensor([[0.5, 3.0]])).tolist() == [[0.5, 0.0]]
+
+
 def test_bounds_of_one_change_no_bit():
     space = gym.spaces.Box(-1, 1, (4,), np.float32)
     actions = th.as_tensor(sample_actions(space, (1000,), np.random.default_rng(0)))
@@ -84,13 +97,55 @@ def test_bits_are_bernoulli():
     assert float(accuracy) == 0.5, "one of two is right in all its bits"
 
 
+@th.no_grad()
+def test_numbers_are_scored_by_the_coefficient_of_determination():
+    space = gym.spaces.Box(np.float32([0, -1]), np.float32([4, 1]))
+    taken = th.tensor([[0.0, 0.5], [3.0, 1.0], [4.0, -1.0], [1.0, 0.25]])
+    scaled = np.array([[-1, 0.5], [0.5, 1], [1, -1], [-0.5, 0.25]])
+    guesses = scaled + np.array([[0.2, 0.1], [-0.3, 0.0], [0.1, 0.4], [0.0, -0.2]])
+    total = sum((scaled[i, d] - scaled[:, d].mean()) ** 2 for i in range(4) for d in range(2))
+    error = sum((scaled[i, d] - guesses[i, d]) ** 2 for i in range(4) for d in range(2))
+    for means, expected in ((guesses, 1 - error / total), (scaled, 1.0), (-guesses, 0.0)):
+        outputs = th.cat([th.as_tensor(means, dtype=th.float32), th.zeros(4, 2)], dim=1)
+        assert float(actions_of(space).score(outputs, taken)[1]) == pytest.approx(expected, abs=1e-6)
+
+
+@th.no_grad()
+def test_a_logit_of_zero_predicts_a_bit_of_zero():
+    actions = actions_of(SPACES["multi_binary"])
+    accuracies = [float(actions.score(th.zeros(2, 3), th.tensor([[bit] * 3] * 2).char())[1]) for bit in (0, 1)]
+    assert accuracies == [1, 0]
+
+
+def test_a_single_component_is_what_discrete_actions_are():
+    outputs, taken = th.randn(5, 3, generator=th.Generator().manual_seed(1)), th.tensor([0, 2, 1, 1, 0])
+    one = actions_of(gym.spaces.MultiDiscrete([3])).score(outputs, taken[:, None])
+    same = actions_of(gym.spaces.Discrete(3)).score(outputs, taken)
+    assert th.allclose(one[0], same[0]) and th.equal(one[1], same[1]) and 0 < float(one[1]) < 1
+
+
+@each_space
+def test_everything_stays_on_the_device_of_its_inputs(kind, monkeypatch):
+    """Tensors of the device "meta" have no values, but mixing them with others fails as on a GPU."""
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", False)  # which would look at values
+    actions, space, meta = actions_of(SPACES[kind]), SPACES[kind], th.device("meta")
+    taken = th.as_tensor(sample_actions(space, (4,), np.random.default_rng(0))).to(meta)
+    found = [actions.inputs(taken), *actions.score(th.randn(4, actions.n_outputs, device=meta), taken)]
+    found += [actions.sample(n, meta) for n in (1, 1000)]
+    found.append(actions.greatest(th.randn(4, actions.input_dim, device=meta)))
+    if (every := actions.enumerate(meta)) is not None:
+        found.append(every)
+    assert {tensor.device.type for tensor in found} == {"meta"}
+    assert {tensor.dtype for tensor in found} == {th.float32}
+
+
 def test_samples_are_all_actions_if_these_are_few():
     every = {
         "multi_discrete": [(*a, *b) for a, b in itertools.product(np.eye(3).tolist(), np.eye(2).tolist())],
         "multi_binary": list(itertools.product([0.0, 1.0], repeat=3)),
     }
     for kind, expected in every.items():
-        sample = actions_of(SPACES[kind]).sample(8, CPU)
+        sample = actions_of(SPACES[kind]).sample(len(expected), CPU)
         assert sorted(map(tuple, sample.tolist())) == sorted(map(tuple, expected))
     assert th.equal(actions_of(SPACES["discrete"]).sample(1, CPU), th.eye(3))
 
@@ -114,6 +169,9 @@ def test_same_is_equality_of_all_components():
     assert same.tolist() == [[i == j or {i, j} == {0, 2} for j in range(4)] for i in range(4)]
     bits = th.tensor([[[1, 0], [0, 1]], [[1, 0], [1, 1]], [[1, 0], [0, 1]]]).char()
     assert actions_of(SPACES["multi_binary_2d"]).same(bits, 0.2).tolist()[0] == [True, False, True]
+    numbers = th.tensor([[0.0, 0.0], [0.5, 0.0], [0.0, -0.75]])
+    same = actions_of(gym.spaces.Box(-1, 1, (2,), np.float32)).same(numbers, 0.5)
+    assert same[0].tolist() == [True, True, False], "a distance of the radius is the same"
 
 
 @pytest.mark.parametrize("unit", [0.01, 1.0, 1000.0])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch as th
-from objective_inputs import DISCRETE, LineEncoder, fit, make_batch
+from objective_inputs import DISCRETE, LineEncoder, fit, loss_without_values, make_batch
 
 from sb3_abisim.networks.decoder import Decoder
 from sb3_abisim.networks.paper import PointMazeEncoder
@@ -34,13 +34,16 @@ def test_decodes_a_sample_around_the_mean():
     th.manual_seed(0)
     objective, batch = BetaVAE(LineEncoder(), DISCRETE, kl_weight=0.5), make_batch(DISCRETE, 4)
     th.manual_seed(3)
-    loss, _ = objective.loss(batch)
+    loss, terms = objective.loss(batch)
     mean = objective.encoder(batch.obs)
     log_std = objective.log_std(mean)
     th.manual_seed(3)
     z = mean + th.exp(log_std) * th.randn(4, 5)
     expected, _ = beta_vae_loss(objective.decoder(z), batch.obs, mean, log_std, 0.5)
     assert float(loss) == pytest.approx(float(expected), rel=1e-5)
+    probabilities = (1 / (1 + (-objective.decoder(z)).exp())).flatten().tolist()
+    errors = [(p - x) ** 2 for p, x in zip(probabilities, batch.obs.flatten().tolist(), strict=True)]
+    assert float(terms["squared_error"]) == pytest.approx(sum(errors) / len(errors), rel=1e-4)
     assert float(loss) != pytest.approx(float(objective.loss(batch)[0]), rel=1e-5), "another sample, another loss"
 
 
@@ -59,6 +62,10 @@ def test_reconstructs_unseen_observations_and_not_under_a_large_penalty():
     variance = 1 / 12  # of uniform numbers, the error of a constant image
     assert error[0.0] < 0.2 * variance
     assert error[100.0] > 0.8 * variance, "a posterior equal to the prior says nothing"
+
+
+def test_the_loss_stays_on_the_device_of_its_inputs():
+    assert loss_without_values(BetaVAE(LineEncoder(), DISCRETE), make_batch(DISCRETE, 4)) == {"meta"}
 
 
 @th.no_grad()
@@ -81,6 +88,13 @@ def test_decoder_takes_its_shape_from_the_encoder():
     objective = BetaVAE(PointMazeEncoder(n_input_channels=2), DISCRETE)
     obs = th.rand(2, 2, 64, 64)
     objective.loss(TensorBatch.of(obs, th.zeros(2, dtype=th.int64), obs))
+
+
+def test_the_weight_of_the_divergence_is_one_and_may_be_none():
+    assert BetaVAE(LineEncoder(), DISCRETE).kl_weight == 1.0
+    objective = BetaVAE(LineEncoder(), DISCRETE, kl_weight=0.0)
+    loss, terms = objective.loss(make_batch(DISCRETE, 4))
+    assert float(loss.detach()) == float(terms["reconstruction"])
 
 
 @pytest.mark.parametrize("kl_weight", [-1.0, math.nan, math.inf])

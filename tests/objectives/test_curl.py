@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch as th
-from objective_inputs import DISCRETE, LineEncoder, change_weights, fit, make_batch
+from objective_inputs import DISCRETE, LineEncoder, change_weights, fit, loss_without_values, make_batch
 
 from sb3_abisim.networks.augmentations import random_crop, random_noise, random_shift
 from sb3_abisim.objectives.curl import CURL, curl_loss
@@ -24,7 +24,7 @@ def test_loss_equals_loop():
         hits += similarities.index(max(similarities)) == i
     loss, terms = curl_loss(query, key, weight)
     assert float(loss) == pytest.approx(total / 4, rel=1e-5)
-    assert float(terms["accuracy"]) == hits / 4
+    assert float(terms["accuracy"]) == hits / 4 and float(terms["info_nce"]) == float(loss)
     # The weight is not symmetric, so its transpose shows which side each embedding stands on.
     assert float(curl_loss(query, key, weight.T)[0]) != pytest.approx(float(loss), rel=1e-2)
 
@@ -40,6 +40,12 @@ def test_both_copies_are_changed_each_in_its_own_way(monkeypatch):
     query = objective.encoder(random_noise(batch.obs, 0.3))
     key = objective.key_encoder(random_noise(batch.obs, 0.3))
     assert float(loss) == pytest.approx(float(curl_loss(query, key, objective.weight)[0]), rel=1e-5)
+
+
+@pytest.mark.parametrize("augmentation", ["noise", "shift", "crop"])
+def test_the_loss_stays_on_the_device_of_its_inputs(augmentation):
+    objective = CURL(LineEncoder(), DISCRETE, augmentation=augmentation)
+    assert loss_without_values(objective, make_batch(DISCRETE, 4)) == {"meta"}
 
 
 def test_gradients_reach_query_and_weight_alone():
@@ -58,6 +64,19 @@ def test_key_encoder_is_a_moving_average():
     objective.after_step()
     for old, new in zip(before, objective.key_encoder.parameters(), strict=True):
         th.testing.assert_close(new, old + 0.25)
+
+
+def test_the_least_and_the_most_of_each_setting():
+    objective = CURL(LineEncoder(), DISCRETE)
+    assert (objective.augmentation, objective.strength, objective.tau) == ("noise", 0.1, 0.05)
+    objective = CURL(LineEncoder(), DISCRETE, tau=1.0)
+    assert not any(parameter.requires_grad for parameter in objective.key_encoder.parameters())
+    change_weights(objective.encoder)
+    objective.after_step()
+    for online, key in zip(objective.encoder.parameters(), objective.key_encoder.parameters(), strict=True):
+        assert th.equal(online, key)
+    with pytest.raises(ValueError, match=r"strength must lie between 0 and 1, got 1.0"):
+        CURL(LineEncoder(), DISCRETE, strength=1.0)
 
 
 def test_similarity_starts_as_a_dot_product():

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from objective_inputs import CONTINUOUS, LineEncoder, change_weights
+from objective_inputs import CONTINUOUS, LineEncoder, change_weights, loss_without_values
 from torch import nn
 
 from sb3_abisim.networks.base import Encoder, make_encoder
@@ -68,6 +68,7 @@ def test_the_loss_equals_a_loop(action_space: gym.Space) -> None:
     with th.no_grad():
         loss, terms = objective.loss(batch)
         total_value = total_progress = 0.0
+        all_values, all_progress = [], []
         for i, g in itertools.product(range(6), range(5)):
             sides = []
             for obs in (batch.obs[i : i + 1], batch.next_obs[i : i + 1]):
@@ -83,6 +84,7 @@ def test_the_loss_equals_a_loop(action_space: gym.Space) -> None:
             least = 0.9**HORIZON
             progress = (math.log(max(next_value, least)) - math.log(max(value, least))) / -math.log(0.9)
             progress = min(1.0, max(-1.0, progress))
+            all_values.append(value), all_progress.append(progress)
             phi, action = objective.encoder(batch.obs[i : i + 1]), batch.actions[i]
             terms_of = th.cat([th.ones(1), nn.functional.one_hot(action, 3).float() if action.dim() == 0 else action])
             for head, target in ((objective.value_head, 0.9 * next_value), (objective.progress_head, progress)):
@@ -92,6 +94,9 @@ def test_the_loss_equals_a_loop(action_space: gym.Space) -> None:
     assert float(terms["value_loss"]) == pytest.approx(total_value / 30, rel=1e-4)
     assert float(terms["progress_loss"]) == pytest.approx(total_progress / 30, rel=1e-4)
     assert float(loss) == pytest.approx((3.0 * total_value + 0.5 * total_progress) / 30, rel=1e-4)
+    assert float(terms["value"]) == pytest.approx(np.mean(all_values), rel=1e-4)
+    unexplained = total_progress / 30 / np.var(all_progress)
+    assert float(terms["progress_r2"]) == pytest.approx(1 - unexplained, rel=1e-4)
 
 
 def test_the_loss_of_unequal_weights() -> None:
@@ -123,6 +128,10 @@ def test_the_target_network_follows_by_tau() -> None:
     after = [*objective.target_encoder.parameters(), *objective.target_head.parameters()]
     for old, now, new in zip(before, online, after, strict=True):
         assert th.allclose(new, 0.75 * old + 0.25 * now, atol=1e-6)
+
+
+def test_the_loss_stays_on_the_device_of_its_inputs() -> None:
+    assert loss_without_values(make(), make_batch()) == {"meta"}
 
 
 # Goals.
@@ -262,8 +271,33 @@ def test_it_begins_with_the_layers_that_the_base_has() -> None:
     for name in ("layers.0.weight", "layers.2.bias"):
         assert th.equal(weights[name], base.state_dict()[name])
     assert th.equal(weights["layers.6.weight"], fresh)
-    with pytest.raises(ValueError, match="has no layer of its base"):
+    with pytest.raises(ValueError, match=r"LineEncoder.* has no layer of its base .*; give .* or warm_start: false$"):
         GoalProgress(LineEncoder(7, 8), DISCRETE, base)
+
+
+def test_the_given_base_is_left_as_it_was() -> None:
+    base = LineEncoder()
+    objective = GoalProgress(LineEncoder(), DISCRETE, base, warm_start=False)
+    copies = (objective.base_encoder, objective.target_encoder, objective.target_head)
+    for module, frozen in ((base, False), *((module, True) for module in copies)):
+        assert {not parameter.requires_grad for parameter in module.parameters()} == {frozen}
+    with th.no_grad():
+        next(base.parameters()).zero_()
+    assert bool(next(objective.base_encoder.parameters()).any())
+
+
+def test_settings_that_nobody_gives() -> None:
+    objective = GoalProgress(LineEncoder(), DISCRETE, LineEncoder())
+    names = ("n_goals", "goal_share", "gamma", "tau", "value_weight", "progress_weight")
+    assert [getattr(objective, name) for name in names] == [128, 0.02, 0.9, 0.02, 10.0, 1.0]
+
+
+def test_the_least_and_the_most_of_each_setting() -> None:
+    objective = make(n_goals=1, tau=1.0, value_weight=0.0, progress_weight=0.0)
+    assert float(objective.loss(make_batch())[0].detach()) == 0.0
+    objective.after_step()
+    for online, target in zip(objective.value_head.parameters(), objective.target_head.parameters(), strict=True):
+        assert th.equal(online, target)
 
 
 def test_the_base_is_the_plain_network() -> None:
@@ -275,9 +309,11 @@ def test_the_base_is_the_plain_network() -> None:
     ("kwargs", "message"),
     [
         ({"n_goals": 0}, "n_goals must be a whole number"),
+        ({"n_goals": 5.0}, "n_goals must be a whole number of at least 1, got 5.0"),
         ({"goal_share": 1.0}, "goal_share must lie between 0 and 1, got 1.0"),
         ({"gamma": 0.0}, "gamma must lie between 0 and 1"),
         ({"tau": 0.0}, "tau must lie in"),
+        ({"tau": 1.5}, r"tau must lie in \(0, 1\], got 1.5"),
         ({"value_weight": -1.0}, "value_weight must be a number of at least 0"),
         ({"progress_weight": math.inf}, "progress_weight must be a number of at least 0"),
     ],

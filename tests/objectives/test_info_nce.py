@@ -5,7 +5,7 @@ import re
 
 import pytest
 import torch as th
-from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, make_batch
+from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, hidden_dims, loss_without_values, make_batch
 
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.objectives.info_nce import InfoNCE, info_nce_loss
@@ -22,7 +22,7 @@ def distance(x, y):
 def test_loss_equals_loop():
     generator = th.Generator().manual_seed(1)
     pairs, candidates = th.randn(4, 6, generator=generator), th.randn(3, 6, generator=generator)
-    positives = th.tensor([2, 0, 0, 1])
+    positives = th.tensor([1, 0, 0, 1])
     excluded = th.tensor([[True, False, True], [False, False, True], [False, False, False], [False, False, False]])
     total = 0.0
     for i in range(4):
@@ -38,13 +38,18 @@ def test_discrete_negatives_are_all_other_actions():
     th.manual_seed(0)
     objective, batch = InfoNCE(LineEncoder(), DISCRETE, l1_penalty=0.3), as_sequences(make_batch(DISCRETE, 5))
     psi, psi_next = objective.encoder(batch.obs), objective.encoder(batch.next_obs)
-    total = norms = 0.0
+    total = norms = hits = 0.0
     for i in range(5):
         pair = th.cat([psi[i], psi_next[i] - psi[i]])
         scores = [-distance(pair, objective.action_encoder(th.eye(3)[a : a + 1])[0]) for a in range(3)]
         total -= scores[int(batch.actions[i, 0])] - math.log(sum(math.exp(s) for s in scores))
+        hits += scores.index(max(scores)) == int(batch.actions[i, 0])
         norms += sum(abs(float(x)) for x in th.cat([psi[i], psi_next[i]]))
-    assert float(objective.loss(batch)[0]) == pytest.approx((total + 0.3 * norms) / 5, rel=1e-4)
+    loss, terms = objective.loss(batch)
+    assert float(loss) == pytest.approx((total + 0.3 * norms) / 5, rel=1e-4)
+    expected = {"info_nce": total / 5, "l1_norm": norms / 5, "accuracy": hits / 5}
+    assert {name: float(term) for name, term in terms.items()} == pytest.approx(expected, rel=1e-4)
+    assert 0 < hits < 5
 
 
 @pytest.mark.parametrize("space", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
@@ -92,9 +97,21 @@ def test_learns_nothing_from_actions_that_do_nothing():
     assert float(objective.loss(unseen)[1]["accuracy"]) < 0.45
 
 
+@pytest.mark.parametrize("k", [1, 2])
+def test_the_loss_stays_on_the_device_of_its_inputs(k):
+    batch = make_batch(DISCRETE, 4)
+    sequences = TensorBatch.of(batch.obs, batch.actions[:, None].expand(-1, k), batch.next_obs)
+    assert loss_without_values(InfoNCE(LineEncoder(), DISCRETE, k=k), sequences) == {"meta"}
+
+
+def test_actions_are_encoded_with_a_hidden_layer():
+    assert hidden_dims(InfoNCE(LineEncoder(), DISCRETE).action_encoder) == [256]
+
+
 def test_refuses_bad_settings():
-    with pytest.raises(ValueError, match="-1"):
-        InfoNCE(LineEncoder(), DISCRETE, l1_penalty=-1.0)
+    for penalty in (-1.0, math.inf):
+        with pytest.raises(ValueError, match=f"l1_penalty must be a number of at least 0, got {penalty}"):
+            InfoNCE(LineEncoder(), DISCRETE, l1_penalty=penalty)
     InfoNCE.check_k(1), InfoNCE.check_k(4)
     with pytest.raises(ValueError, match=re.escape("[1, 4]")):
         InfoNCE.check_k([1, 4])

@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch as th
-from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, make_batch
+from objective_inputs import CONTINUOUS, DISCRETE, LineEncoder, fit, hidden_dims, make_batch
 
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.objectives.ssi import InverseDynamics, adaptive_beta, inverse_dynamics_loss
@@ -32,6 +32,7 @@ def test_adaptive_beta(accuracy):
     skill = max(0.0, (accuracy - 0.25) / 0.75)
     expected = 2.0 * (1 - math.exp(-4 * skill**2))
     assert float(adaptive_beta(2.0, alpha, "chance_corrected", 0.25)) == pytest.approx(expected)
+    assert float(adaptive_beta(2.0, alpha, "chance_corrected")) == float(adaptive_beta(2.0, alpha, "paper"))
 
 
 @th.no_grad()
@@ -155,10 +156,20 @@ def test_adaptive_beta_follows_the_previous_accuracy():
     assert objective.accuracy == before, "evaluation must not change the schedule"
 
 
-@pytest.mark.parametrize("kwargs", [{"l1_penalty": -1.0}, {"l1_penalty": math.nan}, {"adaptive": "sometimes"}], ids=str)
+@pytest.mark.parametrize(
+    "kwargs",
+    [{"l1_penalty": -1.0}, {"l1_penalty": math.nan}, {"l1_penalty": math.inf}, {"adaptive": "sometimes"}],
+    ids=str,
+)
 def test_refuses_bad_settings(kwargs):
     with pytest.raises(ValueError, match=str(next(iter(kwargs.values())))):
         InverseDynamics(LineEncoder(), DISCRETE, **kwargs)
+
+
+def test_settings_that_nobody_gives():
+    objective = InverseDynamics(LineEncoder(), DISCRETE)
+    assert (objective.l1_penalty, objective.adaptive, objective.delta_scale) == (1e-4, None, 1.0)
+    assert hidden_dims(objective.inverse_model) == [256]
 
 
 @pytest.mark.parametrize(("space", "chance"), [(DISCRETE, 1 / 3), (CONTINUOUS, 0.0)])

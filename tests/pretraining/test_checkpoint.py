@@ -6,13 +6,15 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+import torch as th
 from pretrain_inputs import SETTINGS, collect_grids, run
 
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
-from sb3_abisim.pretraining.checkpoint import Checkpoints
+from sb3_abisim.pretraining.checkpoint import Checkpoints, asks_for_more_updates
 from sb3_abisim.pretraining.config import load_config
 from sb3_abisim.pretraining.pretrain import pretrain
 from sb3_abisim.pretraining.trainer import PretrainRun
@@ -25,6 +27,91 @@ def data(tmp_path_factory):
 
 class Interrupted(Exception):
     pass
+
+
+def trained(seed=0):
+    """A module with a buffer, and an optimizer that has made a step."""
+    th.manual_seed(seed)
+    module = th.nn.Sequential(th.nn.Linear(2, 3), th.nn.BatchNorm1d(3))
+    optimizer = th.optim.Adam(module.parameters(), lr=0.1)
+    module(th.rand(4, 2)).pow(2).sum().backward()
+    optimizer.step()
+    return module, optimizer
+
+
+def test_a_checkpoint_brings_everything_back(tmp_path: Path) -> None:
+    module, optimizer = trained()
+    rows = [{"train/loss": 0.5, "n_updates": 3}]
+    checkpoints = Checkpoints(tmp_path, {"n_updates": 9, "learning_rate": 1.0, "shape": (1, 2)})
+    assert not checkpoints.exist() and checkpoints.restore(module, optimizer) == (0, [])
+    checkpoints.save(module, optimizer, 3, rows)
+    assert checkpoints.exist() and [path.name for path in tmp_path.iterdir()] == ["checkpoint-000000003.safetensors"]
+    expected = th.rand(5)
+    other, other_optimizer = trained(seed=1)
+    assert checkpoints.restore(other, other_optimizer) == (3, rows)
+    assert th.equal(th.rand(5), expected), "the random state"
+    assert other.state_dict().keys() == module.state_dict().keys()
+    for name, tensor in module.state_dict().items():
+        assert th.equal(other.state_dict()[name], tensor), name
+    state, again = optimizer.state_dict(), other_optimizer.state_dict()
+    assert again["param_groups"] == state["param_groups"] and again["state"].keys() == state["state"].keys()
+    for index, values in state["state"].items():
+        for name, value in values.items():
+            assert th.equal(again["state"][index][name], value), (index, name)
+
+
+def test_the_newest_one_is_restored_and_the_newest_ones_stay(tmp_path: Path) -> None:
+    module, optimizer = trained()
+    checkpoints = Checkpoints(tmp_path, {"n_updates": 9, "learning_rate": 1.0})
+    (tmp_path / "progress.csv").touch()
+    for n_updates in (999, 1000, 20_000):
+        checkpoints.save(module, optimizer, n_updates, [])
+    assert checkpoints.restore(module, optimizer)[0] == 20_000
+    kept = ["checkpoint-000001000.safetensors", "checkpoint-000020000.safetensors", "progress.csv"]
+    for keep, there in ((3, kept), (2, kept), (1, kept[1:]), (0, kept[2:])):
+        checkpoints.remove(keep=keep)
+        assert sorted(path.name for path in tmp_path.iterdir()) == there
+
+
+def test_the_one_before_a_damaged_one_is_gone_on_from(tmp_path: Path) -> None:
+    module, optimizer = trained()
+    checkpoints = Checkpoints(tmp_path, {"n_updates": 9, "learning_rate": 1.0})
+    for n_updates in (1, 2):
+        checkpoints.save(module, optimizer, n_updates, [])
+    damaged = tmp_path / "checkpoint-000000002.safetensors"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    with pytest.raises(ValueError, match=r"/checkpoint-000000002\.safetensors is damaged; remove it to go on from"):
+        checkpoints.restore(module, optimizer)
+    damaged.unlink()
+    assert checkpoints.restore(module, optimizer)[0] == 1
+
+
+@pytest.mark.parametrize("there", [8, 9, 10])
+def test_a_run_with_more_updates_alone_goes_on(tmp_path: Path, there: int) -> None:
+    module, optimizer = trained()
+    settings = {"n_updates": there, "learning_rate": 1.0, "batch_size": 4}
+    Checkpoints(tmp_path, settings).save(module, optimizer, 5, [])
+    assert asks_for_more_updates(settings, {**settings, "n_updates": 9}) == (there < 9)
+    if there == 10:
+        with pytest.raises(ValueError, match="n_updates: 10 there, 9 here"):
+            Checkpoints(tmp_path, {**settings, "n_updates": 9}).restore(module, optimizer)
+    else:
+        assert Checkpoints(tmp_path, {**settings, "n_updates": 9}).restore(module, optimizer) == (5, [])
+    for change in ({"batch_size": 5}, {"learning_rate": "lin_1.0"}):
+        with pytest.raises(ValueError, match="other settings"):
+            Checkpoints(tmp_path, {**settings, "n_updates": 11, **change}).restore(module, optimizer)
+
+
+def test_a_checkpoint_of_other_settings_is_refused_with_all_that_differ(tmp_path: Path) -> None:
+    module, optimizer = trained()
+    Checkpoints(tmp_path, {"a": 1, "b": (1, 2), "c": "x", "learning_rate": 1.0}).save(module, optimizer, 1, [])
+    here = {"a": 2, "b": [1, 2], "learning_rate": 1.0, "d": 0.5}
+    with pytest.raises(ValueError) as raised:
+        Checkpoints(tmp_path, here).restore(module, optimizer)
+    assert str(raised.value) == (
+        f"{tmp_path}/checkpoint-000000001.safetensors belongs to a run with other settings (a: 1 there, 2 here; "
+        "c: 'x' there, None here; d: None there, 0.5 here); choose another output, or remove the file"
+    )
 
 
 @pytest.mark.parametrize(

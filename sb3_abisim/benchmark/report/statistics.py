@@ -121,7 +121,7 @@ def area_under_curve(steps: NDArray[np.int64], values: Floats) -> Floats:
     """
     if len(steps) == 1:
         return values[:, 0]
-    return np.trapezoid(values, steps, axis=1) / (steps[-1] - steps[0])  # type: ignore[no-any-return]
+    return np.trapezoid(values, steps) / (steps[-1] - steps[0])  # type: ignore[no-any-return]
 
 
 @contextlib.contextmanager

@@ -34,7 +34,7 @@ def test_common_steps() -> None:
     steps, values = statistics.on_common_steps(curves)
     assert steps.tolist() == [15, 20, 25, 30]
     np.testing.assert_allclose(values, [[0.5, 1, 1.5, 2], [4, 5, 6, 7]])
-    with pytest.raises(ValueError, match="no steps in common"):
+    with pytest.raises(ValueError, match=r"^the runs have no steps in common; compare runs of similar budgets$"):
         statistics.on_common_steps([curves[0], (np.array([40, 50]), np.zeros(2))])
 
 
@@ -231,6 +231,8 @@ def test_area_of_one_and_of_two_evaluations() -> None:
 
 def test_aggregates_take_the_seed_0_and_all_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
     assert statistics.iqm(SCORES) == statistics.iqm(SCORES, seed=0) != statistics.iqm(SCORES, seed=1)
+    wins = [statistics.probability_of_improvement(SCORES["a"], {"b": SCORES["b"]}, *seed) for seed in ((), (0,), (1,))]
+    assert wins[0] == wins[1] != wins[2]
     taus = np.linspace(0, 1, 3)
     profiles = [statistics.performance_profiles(SCORES, taus, *seed)[1]["a"] for seed in ((), (0,), (1,))]
     assert np.array_equal(profiles[0], profiles[1]) and not np.array_equal(profiles[0], profiles[2])
