@@ -304,7 +304,7 @@ def test_commands(ours: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["import", "minari", "index/random-v0", "-o", str(tmp_path / "back")], "already holds"),
         (["import", "minari", "absent-v0", "-o", str(tmp_path / "d")], "minari download absent-v0"),
         (["import", "minari", "index/random-v0", "-o", str(ours)], "begun with other arguments"),
-        (["import", "hdf4", "index/random-v0", "-o", str(tmp_path / "d")], "unknown reader 'hdf4'; known are minari"),
+        (["import", "hdf4", "index/random-v0", "-o", str(tmp_path / "d")], "unknown reader 'hdf4'; known are arrays"),
     ):
         with pytest.raises(SystemExit) as exit_info:
             main(arguments)
