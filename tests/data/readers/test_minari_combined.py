@@ -47,7 +47,7 @@ def combine(names: list[str], name: str) -> None:
 
 
 def export(folder: Path, seed: int, env_id: str = "IndexEnv-v0", **kwargs: Any) -> TransitionDataset:
-    collect(env_id, 80, folder / str(seed), seed=seed, n_envs=4, **kwargs)
+    collect(env_id, 40, folder / str(seed), seed=seed, n_envs=4, **kwargs)
     export_dataset(folder / str(seed), f"index/s{seed}-v0")
     return TransitionDataset(folder / str(seed))
 
