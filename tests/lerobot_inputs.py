@@ -26,25 +26,32 @@ def shade(episode: int, frame: int) -> int:
     return 20 + 60 * episode + 10 * frame
 
 
-def write_video(path: Path, shades: list[int], times: list[float] | None = None, codec: str = "libx264") -> None:
+def write_video(
+    path: Path,
+    shades: list[int],
+    times: list[float] | None = None,
+    codec: str = "libx264",
+    size: tuple[int, int] = SIZE,
+) -> None:
     """A video of gray frames.
 
     :param shades: of the frames
     :param times: of the frames, in frames; None for 0, 1, 2 and so on
     :param codec: as PyAV calls it
+    :param size: height and width
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         # The encoder counts in twentieths of a frame.
         stream = container.add_stream(codec, rate=20 * FPS)
-        stream.width, stream.height = SIZE[::-1]
+        stream.width, stream.height = size[::-1]
         stream.pix_fmt = "yuv420p"
         # Seeking lands before what is looked for.
         stream.codec_context.gop_size = 4
         if codec == "libx264":
             stream.options = {"qp": "4"}
         for i, value in enumerate(shades):
-            frame = av.VideoFrame.from_ndarray(np.full((*SIZE, 3), value, np.uint8), format="rgb24")
+            frame = av.VideoFrame.from_ndarray(np.full((*size, 3), value, np.uint8), format="rgb24")
             frame.pts = round(20 * (i if times is None else times[i]))
             container.mux(stream.encode(frame))
         container.mux(stream.encode())

@@ -185,7 +185,7 @@ def test_a_registered_id_or_a_space_gives_the_action_space(tmp_path: Path) -> No
         ({"episode_ends": [2, 3], "terminations": [1, 0, 0]}, "name every step with a termination"),
         ({"episode_ends": [2, 2, 3]}, "must ascend up to that"),
         ({"episode_ends": [0, 3]}, "must ascend up to that"),
-        ({"episode_ends": [2]}, "must ascend up to that"),
+        ({"episode_ends": [2], "terminations": None}, "must ascend up to that"),
         ({"episode_ends": [2.0, 3.0]}, "give whole numbers"),
         ({"factor_x": np.zeros(3)}, r"factor|x of shape \(3,\) for 3 actions"),
         ({"factor_x": np.array(list("abcd"))}, "must hold numbers"),
@@ -201,6 +201,8 @@ def test_episodes_that_differ_are_named(tmp_path: Path) -> None:
     other = episode(observations=frames(4, shape=(3, 5, 4)))
     with pytest.raises(ValueError, match=r"episode 1: observations are \(3, 5, 4\)"):
         read([episode(), other], tmp_path / "a")
+    with pytest.raises(ValueError, match="episode 1 has observations of float64; convert them to uint8"):
+        read([episode(), episode(observations=frames(4) / 255)], tmp_path / "floats")
     with pytest.raises(ValueError, match=r"episode 1: .* dict in some episodes"):
         read([episode(), episode(observations={"camera": frames(4)})], tmp_path / "b")
     with pytest.raises(ValueError, match=r"actions of int64 \(\) and of float64 \(2,\)"):

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -82,11 +83,11 @@ def train(
     env = make(n_envs) if env is None else env
     dictionary = isinstance(env.observation_space, gym.spaces.Dict)
     more = {"policy_kwargs": {"net_arch": [4]}, "device": "cpu", "seed": 0}
-    if algorithm is not PPO:
+    if algorithm not in (PPO, RecurrentPPO):
         more |= {"learning_starts": 10**6, "buffer_size": 1000, "train_freq": 1}
     else:
         more |= {"n_epochs": 1, "batch_size": 16, "n_steps": n_steps}
-    policy = "MultiInputPolicy" if dictionary else "MlpPolicy"
+    policy = "MultiInputPolicy" if dictionary else "MlpLstmPolicy" if algorithm is RecurrentPPO else "MlpPolicy"
     model = algorithm(policy, env, **(more | kwargs))
     for _ in range(times):
         model.learn(n_steps * n_envs, reset_num_timesteps=reset)
@@ -141,19 +142,20 @@ def test_a_full_replay_buffer_begins_at_its_oldest_transition(tmp_path: Path) ->
     assert transitions(dataset) == {step: happened[step] for step in kept}
 
 
-@pytest.mark.parametrize("n_steps", [12, 50], ids=["not full", "full"])
+@pytest.mark.parametrize("n_steps", [12, 50, 51], ids=["not full", "full", "full and at its beginning"])
 def test_one_array_for_both_observations(n_steps: int, tmp_path: Path) -> None:
     """Of each episode, the last transition is lost; so is the oldest of a full ring."""
     kwargs = {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}}
     model, traces = train(DQN, n_steps, buffer_size=2 * 17, **kwargs)
-    assert model.replay_buffer.full == (n_steps == 50)
+    assert model.replay_buffer.full == (n_steps >= 50) and (model.replay_buffer.pos == 0) == (n_steps == 51)
     dataset = read(model.replay_buffer, tmp_path / "d")
     happened, over = of(traces, "actions"), of(traces, "ends")
-    kept = [step for trace in traces for step in list(trace.actions)[-min(n_steps, 17) :][n_steps == 50 :]]
+    kept = [step for trace in traces for step in list(trace.actions)[-min(n_steps, 17) :][n_steps >= 50 :]]
     newest = [list(trace.actions)[-1] for trace in traces]
     lost = [s for s in kept if (*s[:2], s[2] + 1) in over and s not in newest]
     assert len(lost) > 2
     assert transitions(dataset) == {step: happened[step] for step in kept if step not in lost}
+    assert {end for step, end in ends(dataset).items() if step in lost} == {CUT}
     assert dataset.meta["source"]["unseen_ends"] == len(lost)
     assert f"{len(lost)} transitions whose next observation is not in the buffer" in import_report(tmp_path / "d")
 
@@ -226,7 +228,7 @@ def test_a_dict_with_a_broken_vector_is_cut_there(tmp_path: Path) -> None:
     space = TraceEnv(form="dict").observation_space
     buffer = DictReplayBuffer(10, space, gym.spaces.Discrete(3), device="cpu")
     rows = [
-        {"camera": np.zeros((1, *SHAPE), np.uint8), "angle": np.full((1, 2), i), "gear": np.array([0])}
+        {"camera": np.zeros((1, *SHAPE), np.uint8), "angle": np.float32([[i, np.nan]]), "gear": np.array([0])}
         for i in (0, 1, 2, 9, 4)
     ]
     for before, after in ((0, 1), (1, 2), (3, 4)):
@@ -264,9 +266,9 @@ def test_actions_that_are_not_scaled(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("trained", [False, True], ids=["before get()", "after get()"])
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_a_rollout_buffer_lacks_what_ends_episodes(n_envs: int, trained: bool, tmp_path: Path) -> None:
-    model, traces = train(PPO, 32, n_envs=n_envs)
+@pytest.mark.parametrize(("algorithm", "n_envs"), [(PPO, 1), (PPO, 3), (RecurrentPPO, 3)])
+def test_a_rollout_buffer_lacks_what_ends_episodes(algorithm: Any, n_envs: int, trained: bool, tmp_path: Path) -> None:
+    model, traces = train(algorithm, 32, n_envs=n_envs)
     buffer = model.rollout_buffer
     assert buffer.generator_ready
     if not trained:

@@ -174,13 +174,14 @@ def test_where_seeking_leads_too_far_the_file_is_read_from_its_start(
 
     monkeypatch.setattr(reader_module, "_decoded", late)
     assert np.abs(shades(read(written, tmp_path / "d")) - EXPECTED).max() <= CLOSE
-    assert None in begins
+    assert begins[0] is not None and None in begins
 
 
 def test_seeking_spares_the_episodes_before(written: Path) -> None:
     begin = LENGTHS[1] / FPS
     first, _ = next(iter(reader_module._decoded(video_of(written), begin, 10.0)))
     assert 0 < first <= begin
+    assert len(list(reader_module._decoded(video_of(written), None, 2.5 / FPS))) == 3, "and those after"
 
 
 def change_info(source: Path, **changes: Any) -> None:
@@ -242,6 +243,7 @@ def test_axes_whose_names_are_not_true(source: Path, tmp_path: Path) -> None:
         ("action", lambda a: [[1.0, 2.0]] * 8 + [[1.0]], "lists of .1, 2. numbers"),
         ("action", lambda a: [[1.0, 2.0]] * 8 + [None], "'action' has gaps"),
         ("action", lambda a: [["a", "b"]] * 9, "in place of numbers"),
+        ("action", lambda a: [[1.0, 2.0]] * 8 + [[1.0, None]], "or gaps, in place of numbers"),
         ("action", lambda a: lists(np.full((9, 2), np.nan, np.float32)), "finite numbers"),
         ("timestamp", lambda a: [*a[:-1].tolist(), None], "'timestamp' has gaps"),
     ],
@@ -254,6 +256,13 @@ def test_rows_that_do_not_fit(name: str, change: Any, message: str, source: Path
     with pytest.raises(ValueError, match=message):
         read(source, tmp_path / "d")
     assert not (tmp_path / "d" / "meta.json").exists()
+
+
+def test_a_video_of_another_size(source: Path, tmp_path: Path) -> None:
+    video_of(source).unlink()
+    write_video(video_of(source), TWO, size=(48, 32))
+    with pytest.raises(ValueError, match=r"a frame of 48 x 32 pixels at 0\.0000 s .* in place of 32 x 48"):
+        read(source, tmp_path / "d")
 
 
 def test_files_that_are_damaged_or_missing(source: Path, tmp_path: Path) -> None:

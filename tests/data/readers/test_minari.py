@@ -98,6 +98,8 @@ def test_round_trip_is_lossless(ours: Path, tmp_path: Path) -> None:
     assert (after.env_id, after.env_kwargs) == ("IndexEnv-v0", {})
     assert (after.meta["seed"], after.meta["policy"]) == (3, "uniform")
     assert after.meta["source"]["minari"] == "index/random-v0"
+    import_dataset("index/random-v0", tmp_path / "named", env_id="Else-v0")
+    assert TransitionDataset(tmp_path / "named").env_id == "Else-v0"
 
 
 def test_frames_large_enough_for_jpeg_stay_exact(tmp_path: Path) -> None:
