@@ -301,6 +301,10 @@ def _agreed(parts: list[str]) -> dict[str, Any]:
         if part in seen:
             continue
         seen.add(part)
+        try:
+            _check_id(part)
+        except ValueError:
+            return {}  # a forged one, which could lead out of the store
         path = get_dataset_path(part) / "data"
         metadata = MinariStorage.read_raw_metadata(path) if path.is_dir() else {}
         if METADATA_KEY in metadata:
@@ -309,7 +313,7 @@ def _agreed(parts: list[str]) -> dict[str, Any]:
             waiting += [str(other) for other in metadata["combined_datasets"]]
         else:
             return {}
-    keys = ("env_id", "env_kwargs", CONTENT_HASH_KEY, "policy")
+    keys = ("env_id", "env_kwargs", CONTENT_HASH_KEY, "policy") if blocks else ()
     return {key: blocks[0][key] for key in keys if all(block[key] == blocks[0][key] for block in blocks)}
 
 

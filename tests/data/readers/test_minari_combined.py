@@ -147,6 +147,19 @@ def test_nothing_that_the_record_names_is_run(tmp_path: Path, store: Path) -> No
     assert TransitionDataset(tmp_path / "both").env_id == "SpelledIndexEnv-v0" and not (tmp_path / "evil").exists()
 
 
+@pytest.mark.parametrize("parts", [["index/both-v0"], ["../outside/s0-v0"]])
+def test_forged_parts_lead_nowhere(parts: list[str], tmp_path: Path, store: Path) -> None:
+    """Neither in a circle nor out of the store."""
+    export(tmp_path, 0)
+    combine(["index/s0-v0"], "index/both-v0")
+    shutil.copytree(store / "index" / "s0-v0", store.parent / "outside" / "s0-v0")
+    path = store / "index" / "both-v0" / "data" / "metadata.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"combined_datasets": parts}))
+    with pytest.warns(UserWarning, match="are lost"):
+        import_dataset("index/both-v0", tmp_path / "both")
+    assert TransitionDataset(tmp_path / "both").env_id == "index/both-v0"
+
+
 def test_an_export_says_which_environment_it_is_of(tmp_path: Path) -> None:
     export(tmp_path, 0, "SpelledIndexEnv-v0", env_kwargs={"offset": 1})
     spec = minari.load_dataset("index/s0-v0").spec.env_spec
