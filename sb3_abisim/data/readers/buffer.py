@@ -78,14 +78,9 @@ def import_buffer(
     layout = recorded_layout(source.observation_space, image_key, what)
     scaled = off_policy if scaled_actions is None else scaled_actions
     actions = _executed_actions(source.action_space, buffer.actions, copies, scaled, clipped=not off_policy)
-    unseen = sum(int((copy.ended & ~copy.next_known).sum()) for copy in copies)
-    dropped = sum(int(((copy.ends != INSIDE) & ~copy.next_known).sum()) for copy in copies)
-    left_out = ["rewards"]
-    if dropped:
-        left_out.append(f"{dropped} transitions whose next observation is not in the buffer")
+    left_out = ["rewards", *_lost(copies)]
     if isinstance(source, ReplayBuffer) and not source.handle_timeout_termination:
         left_out.append("which episodes were truncated (without handle_timeout_termination, all count as terminated)")
-    left_out += unread_keys(source.observation_space, layout)
     return write_dataset(
         folder,
         (segment for i, copy in enumerate(copies) for segment in _segments(buffer, copy, i, actions, layout)),
@@ -97,10 +92,16 @@ def import_buffer(
             "n_envs": source.n_envs,
             CHANNELS_KEY: layout.channels,
             LOSSY_KEY: None,
-            LEFT_OUT_KEY: left_out,
-            UNSEEN_ENDS_KEY: unseen,
+            LEFT_OUT_KEY: left_out + unread_keys(source.observation_space, layout),
+            UNSEEN_ENDS_KEY: sum(int((copy.ended & ~copy.next_known).sum()) for copy in copies),
         },
     )
+
+
+def _lost(copies: list["_Copy"]) -> list[str]:
+    """What is left out because the buffer lacks an observation, for the report."""
+    n = sum(int(((copy.ends != INSIDE) & ~copy.next_known).sum()) for copy in copies)
+    return [f"{n} transitions whose next observation is not in the buffer"] if n else []
 
 
 @dataclass(frozen=True)

@@ -152,10 +152,12 @@ class _Recording:
         cameras = [key for key, feature in self.features.items() if feature.get("dtype") == "video"]
         if camera is None and len(cameras) == 1:
             camera = cameras[0]
+        if not cameras:
+            raise ValueError(f"{self.path} has no videos; images in its tables are not read, record them as videos")
         if camera not in cameras:
             raise ValueError(
-                f"{self.path} has {len(cameras)} videos ({', '.join(cameras) or 'images in tables are not read'}), not "
-                f"{camera!r}; choose one with --image-key"
+                f"{self.path} has {len(cameras)} videos ({', '.join(cameras)}), not {camera!r}; choose one with "
+                "--image-key"
             )
         if any(value for key, value in (self.features[camera].get("info") or {}).items() if "depth" in key):
             raise ValueError(f"{camera} of {self.path} is a map of depths, which is no image; choose another camera")

@@ -210,6 +210,7 @@ def features(**changes: Any) -> dict[str, Any]:
             "video", (*SIZE, 3), info={"video.is_depth_map": True}))}, "map of depths"),
         ({"features": features(observation__images__top=feature("video", (64, 48, 3)))}, "info.json says"),
         ({"features": features(observation__images__top=feature("image", (*SIZE, 3)))}, "has 1 videos"),
+        ({"features": {"action": feature("float32", (2,))}}, "has no videos; images in its tables are not read"),
         ({"total_episodes": 4}, "announces 4 episodes and describes 3"),
         ({"total_episodes": 0}, "announces 0 episodes"),
         ({"data_path": "../{chunk_index}/{file_index}"}, "lead out of the folder"),
