@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sb3_abisim.data.collect import collect
     from sb3_abisim.data.dataset import TransitionDataset
     from sb3_abisim.data.format import CUT, TERMINATED, TRUNCATED
+    from sb3_abisim.data.importing import import_dataset
     from sb3_abisim.data.writer import Segment, write_dataset
     from sb3_abisim.envs.base import BatchEnv, SingleEnv
     from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
@@ -55,6 +56,7 @@ _PUBLIC = {
     "VecEncodeObservations": "rl.vec_encode",
     "collect": "data.collect",
     "from_module": "networks.from_module",
+    "import_dataset": "data.importing",
     "load_encoder": "networks.encoder_file",
     "merge_encoder": "rl.merge",
     "policy_kwargs": "rl.policy_kwargs",
@@ -87,6 +89,7 @@ __all__ = [
     "__version__",
     "collect",
     "from_module",
+    "import_dataset",
     "load_encoder",
     "merge_encoder",
     "policy_kwargs",

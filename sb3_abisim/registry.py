@@ -82,12 +82,14 @@ class Reader:
     """Makes a dataset folder of data that something else has written.
 
     :param name: the word of ``sb3-abisim data import``
-    :param read_fn: called with the source (a text) and the folder to write; returns the dataset's hash
+    :param read_fn: called with the source (a text, or in Python any object) and the folder to write; returns the
+        dataset's hash. Its keyword-only parameters are options: ``--env`` becomes ``env_id``, ``--image-key``
+        ``image_key``
     :param help: what a source is, in a line
     """
 
     name: str
-    read_fn: Callable[[str, Any], str]
+    read_fn: Callable[..., str]
     help: str
 
 
@@ -211,7 +213,7 @@ def register_network(
     _NETWORKS.add(name, Network(name, factory, observation_shape))
 
 
-def register_reader(name: str, read_fn: Callable[[str, Any], str], *, help: str = "") -> None:
+def register_reader(name: str, read_fn: Callable[..., str], *, help: str = "") -> None:
     """Add a reader of datasets; ``sb3-abisim data import NAME SOURCE -o DIR`` calls it.
 
     :param name: its name

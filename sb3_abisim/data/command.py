@@ -5,7 +5,8 @@ import sys
 from collections.abc import Sequence
 
 from sb3_abisim.common.cli import make_parser, run
-from sb3_abisim.registry import get_reader
+from sb3_abisim.data.importing import import_dataset
+from sb3_abisim.registry import readers
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -33,15 +34,22 @@ def _import_parser() -> argparse.ArgumentParser:
         "Make a dataset folder of what something else has written; rewards are dropped.",
         "data import minari nav2d/random-v0 -o data/nav2d",
     )
-    parser.add_argument("reader", metavar="READER", help="name of a reader, such as minari")
-    parser.add_argument("source", metavar="SOURCE", help="what it reads, such as the id of a Minari dataset")
+    known = "; ".join(f"{name} ({reader.help})" for name, reader in readers().items())
+    parser.add_argument("reader", metavar="READER", help=f"name of a reader: {known}; or yours")
+    parser.add_argument("source", metavar="SOURCE", help="what it reads, such as a file or the id of a Minari dataset")
     parser.add_argument("-o", "--output", required=True, metavar="DIR", help="the dataset's folder")
+    parser.add_argument(
+        "--env", metavar="ID",
+        help="environment that was recorded; its action space holds where the source has none (arrays, lerobot)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--image-key", metavar="KEY", help="which of several observations is the image (default: the only one)"
+    )
     return parser
 
 
 def _import(args: argparse.Namespace) -> None:
-    hash = get_reader(args.reader).read_fn(args.source, args.output)
-    print(f"{args.output}: imported from {args.source} (hash {hash[:16]}); rewards were dropped")
+    import_dataset(args.reader, args.source, args.output, env_id=args.env, image_key=args.image_key)
 
 
 def _export_parser() -> argparse.ArgumentParser:

@@ -27,6 +27,10 @@ from sb3_abisim.common.spaces import is_channels_first
 MakeFn = Callable[[], gym.Env[Any, Any]]
 # Where the channels of an observation are: (C, H, W), (H, W, C) or (H, W).
 FIRST, LAST, NONE = "first", "last", "none"
+_WRAPPERS = (
+    "a wrapper makes others into such (gymnasium.wrappers.AddRenderObservation, TransformObservation), see "
+    "--env-wrapper"
+)
 
 
 @dataclass(frozen=True)
@@ -47,11 +51,12 @@ class ImageLayout:
     layouts: dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
 
     @classmethod
-    def of(cls, space: gym.Space[Any], image_key: str | None = None) -> "ImageLayout":
+    def of(cls, space: gym.Space[Any], image_key: str | None = None, remedy: str = _WRAPPERS) -> "ImageLayout":
         """The layout of an observation space.
 
         :param space: of one environment
         :param image_key: which key of a ``Dict`` space holds the image; None for the only one that does
+        :param remedy: what to do about observations that are no such images, for messages
         :raises ValueError: if there is no image, or several and no ``image_key``
         """
         factors: dict[str, str] = {}
@@ -60,15 +65,20 @@ class ImageLayout:
             images = [key for key, part in space.spaces.items() if _is_image(part)]
             if image_key is None and len(images) != 1:
                 raise ValueError(
-                    f"the observations have {len(images)} images ({', '.join(images) or 'none'}) in {space}; choose one"
-                    " with --image-key" + ("" if images else ", made uint8 in 0..255 by a wrapper")
+                    f"the observations have {len(images)} images ({', '.join(images) or 'none'}) in {space}; "
+                    + ("choose one with --image-key" if images else f"one must be uint8 in 0..255: {remedy}")
                 )
             image_key = images[0] if image_key is None else image_key
             if image_key not in images:
                 raise ValueError(f"image_key {image_key!r} is not one of the images {images} in {space}")
             for key, part in space.spaces.items():
                 if key != image_key and isinstance(part, spaces.Box | spaces.Discrete | spaces.MultiBinary):
-                    name = re.sub(r"\W|^(?=\d)", "_", key)
+                    name = factor_name(key)
+                    if name in factors:
+                        raise ValueError(
+                            f"the observations {factors[name]!r} and {key!r} would both become the factor {name!r}; "
+                            "rename one"
+                        )
                     factors[name], layouts[name] = key, (np.dtype(part.dtype), tuple(part.shape or ()))
             space = space.spaces[image_key]
         elif image_key is not None:
@@ -76,8 +86,7 @@ class ImageLayout:
         if not _is_image(space):
             raise ValueError(
                 "observations must be uint8 images in 0..255 of shape (channels, height, width), (height, width, "
-                f"channels) or (height, width), got {space}; a wrapper makes others into such "
-                "(gymnasium.wrappers.AddRenderObservation, TransformObservation), see --env-wrapper"
+                f"channels) or (height, width), got {space}; {remedy}"
             )
         shape = space.shape
         assert shape is not None
@@ -99,6 +108,30 @@ class ImageLayout:
             image = np.moveaxis(image, -1, 0)
         return np.array(image, np.uint8).reshape(self.space.shape)
 
+    def images(self, observations: Any) -> NDArray[np.uint8]:
+        """The images of several observations, channels first, a view where that is possible.
+
+        :param observations: array [n, ...] of what the environment shows, for a ``Dict`` one array by key
+        :return: [n, C, H, W] of the arrays' own dtype
+        :raises ValueError: for observations of another shape
+        """
+        images = np.asarray(observations if self.key is None else observations[self.key])
+        if self.channels == LAST and images.ndim == 4:
+            images = np.moveaxis(images, -1, 1)
+        elif self.channels == NONE and images.ndim == 3:
+            images = images[:, None]
+        if images.shape[1:] != self.space.shape:
+            raise ValueError(f"observations are {images.shape[1:]}, channels first, in place of {self.space.shape}")
+        return images
+
+    def rests(self, observations: Any) -> dict[str, NDArray[Any]]:
+        """What else several observations hold, by the names of the factors.
+
+        :param observations: as for :meth:`images`
+        """
+        rows = {name: (np.asarray(observations[key]), *self.layouts[name]) for name, key in self.factors.items()}
+        return {name: array.astype(dtype).reshape(len(array), *shape) for name, (array, dtype, shape) in rows.items()}
+
     def rest(self, observation: Any) -> dict[str, NDArray[Any]]:
         """What else the observation holds, by the names of the factors.
 
@@ -109,6 +142,14 @@ class ImageLayout:
     def blank(self) -> dict[str, NDArray[Any]]:
         """What :meth:`rest` returns, zeros."""
         return {name: np.zeros(shape, dtype) for name, (dtype, shape) in self.layouts.items()}
+
+
+def factor_name(key: str) -> str:
+    """The name of the factor that a key of observations becomes, of letters, digits and underscores.
+
+    :param key: such as "observation.state"
+    """
+    return re.sub(r"\W|^(?=\d)", "_", key, flags=re.ASCII)
 
 
 def _is_image(space: gym.Space[Any]) -> bool:

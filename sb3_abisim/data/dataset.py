@@ -19,6 +19,13 @@ from sb3_abisim.common.files import file_hash
 from sb3_abisim.common.spaces import space_from_json
 from sb3_abisim.common.transitions import TransitionBatch
 from sb3_abisim.common.vocabulary import current_env_kwargs
+from sb3_abisim.data.episodes import (
+    frames_of_eval,
+    segments_before,
+    shuffle_chunks,
+    stack_members,
+    steps_remaining,
+)
 from sb3_abisim.data.format import (
     CONFIG_NAME,
     CUT,
@@ -29,7 +36,6 @@ from sb3_abisim.data.format import (
     array_file,
     array_layout,
     check_meta,
-    continued_segments,
     from_json_file,
     holds_frames,
 )
@@ -43,8 +49,6 @@ _VERIFIED: set[tuple[str, int, int, str]] = set()
 # Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbors with it, so
 # that up to twenty times as much was resident meanwhile. Pages stay in its cache: reading them again is cheap.
 RELEASE_AFTER_BYTES = 16 * 2**20
-# Which segments make up the eval split is a property of the dataset, not of a run.
-_SPLIT_SEED = 20240229
 
 Split = Literal["train", "eval"]
 # Steps between two observations: a number, or the fewest and the most of them.
@@ -105,8 +109,8 @@ class TransitionDataset:
         self._ends = np.concatenate([self._read("ends", k) for k in range(n_shards)])
         self._last = np.flatnonzero(self._ends != INSIDE)  # the last frame of each segment
         self._check_ends()
-        self._remaining = self._make_remaining()
-        self._before = self._make_before()
+        self._remaining = steps_remaining(self._last)
+        self._before = segments_before(self.meta, self._ends, self._last)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.path, self.eval_fraction, False)
@@ -141,7 +145,10 @@ class TransitionDataset:
     def _has_steps(self, k: int, split: Split | None) -> NDArray[np.bool_]:
         """Per frame, whether frame t + k belongs to the same episode, of the split."""
         valid: NDArray[np.bool_] = self._remaining >= k
-        return valid if split is None else valid & (self._in_eval() == (split == "eval"))
+        if split is None:
+            return valid
+        in_eval = frames_of_eval(self._last, self._before, self.eval_fraction)
+        return valid & (in_eval if split == "eval" else ~in_eval)
 
     def pairs(self, k: Steps = 1, split: Split | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """All pairs of frames (t, t + steps) of the same episode.
@@ -226,21 +233,11 @@ class TransitionDataset:
         # Sampled now and not at the first batch, so that mistakes raise here.
         generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch])))
         order = (
-            generator.permutation(len(starts)) if chunk_length == 1 else self._shuffle(starts, chunk_length, generator)
+            generator.permutation(len(starts))
+            if chunk_length == 1
+            else shuffle_chunks(starts, chunk_length, self._ends, self._last, generator)
         )
         return self._iterate(starts[order], steps[order], batch_size, start, sequences, chunk_length > 1)
-
-    def _shuffle(
-        self, starts: NDArray[np.int64], chunk_length: int, generator: np.random.Generator
-    ) -> NDArray[np.int64]:
-        """An order of transitions in which those of a chunk stay together."""
-        lengths = np.diff(self._last, prepend=-1)
-        # Each segment is cut at multiples of chunk_length, counted from a place before its beginning.
-        before = generator.integers(chunk_length, size=len(lengths))
-        position = np.arange(self.n_frames) - np.repeat(self._last + 1 - lengths - before, lengths)
-        begins = (position % chunk_length == 0) | (np.roll(self._ends, 1) != INSIDE)
-        chunk = np.cumsum(begins)[starts]
-        return np.argsort(generator.permutation(chunk.max() + 1)[chunk], kind="stable")
 
     def _iterate(
         self,
@@ -278,26 +275,13 @@ class TransitionDataset:
             return self._render_fn(self._factors(index))
         if self.frame_stack == 1:
             return self._gather("frames", index)
-        members = self._stack_members(index)
+        members = stack_members(index, self.frame_stack, self._ends, self._last, self._before)
         there = members >= 0
         # Stacks of steps that follow each other share frames: each is read once.
         read, places = np.unique(members[there], return_inverse=True)
         out = np.zeros((*members.shape, *self._frame_shape), np.uint8)
         out[there] = self._gather("frames", read)[places]
         return out.reshape(len(index), *self.observation_space.shape)
-
-    def _stack_members(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The frames of stacks, oldest first, [m, frame_stack]; -1 for what is before an episode's first."""
-        members = np.full((len(index), self.frame_stack), -1, np.int64)
-        members[:, -1] = frame = index.copy()
-        for column in range(self.frame_stack - 2, -1, -1):
-            starts = np.flatnonzero((frame > 0) & (self._ends[frame - 1] != INSIDE) | (frame == 0))
-            # The first frame of a segment that goes on with another is that one's last.
-            before = self._before[np.searchsorted(self._last, frame[starts])]
-            frame = np.maximum(frame - 1, -1)
-            frame[starts] = np.where(before >= 0, self._last[before] - 1, -1)
-            members[:, column] = frame
-        return members
 
     def _factors(self, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
         return {name: self._gather(f"factor_{name}", index) for name in self.meta["factors"]}
@@ -346,29 +330,6 @@ class TransitionDataset:
         if array.dtype != dtype or array.shape != expected:
             raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
         return array
-
-    def _make_remaining(self) -> NDArray[np.int32]:
-        """Steps from each frame to the last of its segment."""
-        lengths = np.diff(self._last, prepend=-1)
-        return (np.repeat(self._last, lengths) - np.arange(self.n_frames)).astype(np.int32)
-
-    def _make_before(self) -> NDArray[np.int64]:
-        """Per segment, the one whose episode it goes on with in the next shard; -1 where it begins one."""
-        before = continued_segments(self.meta, np.diff(self._last, prepend=-1) - 1)
-        cut = self._ends[self._last] == CUT
-        return np.where((before >= 0) & cut[before], before, -1)
-
-    def _in_eval(self) -> NDArray[np.bool_]:
-        """Per frame, whether its episode belongs to the split "eval"."""
-        begins = self._before < 0
-        episode = np.empty(len(begins), np.int64)
-        episode[begins] = np.arange(n_episodes := int(begins.sum()))
-        for segment in np.flatnonzero(~begins):
-            episode[segment] = episode[self._before[segment]]
-        n_eval = min(n_episodes - 1, max(1, round(self.eval_fraction * n_episodes))) if self.eval_fraction else 0
-        chosen = np.zeros(n_episodes, dtype=bool)
-        chosen[np.random.Generator(np.random.PCG64(_SPLIT_SEED)).permutation(n_episodes)[:n_eval]] = True
-        return np.repeat(chosen[episode], np.diff(self._last, prepend=-1))
 
     def _check_files(self, verify: bool | None) -> None:
         entries = {name: entry for shard in self.meta["shards"] for name, entry in shard["files"].items()}

@@ -2,20 +2,28 @@
 
 Observations are stored without JPEG. What a Minari dataset says about its environment is only copied as text. Nothing
 here makes an environment, because to open one that a stranger's file describes can run the stranger's code.
+
+``minari.combine_datasets`` copies episodes with their infos, and so our factors, but not our block of metadata. The id
+of the environment then comes from the blocks of the combined datasets, where these are in the store, else from the
+``env_spec`` that an export writes where the id is registered.
 """
 
+import copy
 import hashlib
 import json
+import os
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_abisim.common.spaces import fit_actions, is_channels_first, space_from_json, space_to_json
+from sb3_abisim.common.spaces import fit_actions, space_from_json, space_to_json
+from sb3_abisim.data.copies import LAST, ImageLayout
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import (
     CHAINED_FORMAT_VERSION,
@@ -28,7 +36,10 @@ from sb3_abisim.data.format import (
     TRUNCATED,
     check_factor_layout,
     check_spaces,
+    describe_factors,
 )
+from sb3_abisim.data.importing import CHANNELS_KEY, LEFT_OUT_KEY, LOSSY_KEY
+from sb3_abisim.data.recorded import recorded_layout, unread_keys
 from sb3_abisim.data.writer import Segment, check_folder, write_segments
 from sb3_abisim.registry import register_reader
 
@@ -55,7 +66,7 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
     dataset = TransitionDataset(folder)
     source = dataset.meta["source"]
     # What else has written it may say of its source whatever it likes.
-    channels_last = isinstance(source, dict) and bool(source.get("channels_last"))
+    channels_last = isinstance(source, dict) and (source.get(CHANNELS_KEY) == LAST or bool(source.get("channels_last")))
     space = dataset.observation_space
     if channels_last:
         space = _move_channels(space, 0, -1)
@@ -76,12 +87,24 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
     # Without its sum while episodes are missing: a kill leaves a dataset that is not taken for a whole one.
     ours = {key: dataset.meta[key] for key in IDENTITY_KEYS} | {"rewards_recorded": False, "content_sha256": None}
     try:
-        stored.storage.update_metadata({METADATA_KEY: ours})
+        stored.storage.update_metadata({METADATA_KEY: ours} | _env_spec(dataset))
         stored.storage.update_episodes(_to_episode(s, channels_last) for s in _hashed(_segments(dataset), content))
         stored.storage.update_metadata({METADATA_KEY: ours | {"content_sha256": content.hexdigest()}})
     except BaseException:
         minari.delete_dataset(dataset_id)
         raise
+
+
+def _env_spec(dataset: TransitionDataset) -> dict[str, str]:
+    """Minari's own record of the environment, where it is registered and can be written as text."""
+    if dataset.env_id not in gym.registry:
+        return {}
+    spec = copy.deepcopy(gym.registry[dataset.env_id])
+    spec.kwargs |= dataset.env_kwargs
+    try:
+        return {"env_spec": spec.to_json()}
+    except (TypeError, ValueError):
+        return {}  # its entry point is an object
 
 
 def _check_id(dataset_id: str) -> None:
@@ -96,13 +119,18 @@ def _check_id(dataset_id: str) -> None:
         ) from None
 
 
-def import_dataset(dataset_id: str, folder: str | Path) -> str:
+def import_dataset(
+    dataset_id: str, folder: str | os.PathLike[str], *, env_id: str | None = None, image_key: str | None = None
+) -> str:
     """Make a dataset folder from Minari's local store; rewards are dropped.
 
-    Observations must be uint8 images (channels first or last) and actions as ``collect`` takes them.
+    Observations must be uint8 images (channels first, channels last or gray) or a ``Dict`` with one, and actions as
+    ``collect`` takes them.
 
     :param dataset_id: of a dataset that is already in the local store
     :param folder: new or empty
+    :param env_id: recorded with the dataset; None for what Minari's dataset says
+    :param image_key: which key of a ``Dict`` of observations is the image; None for the only one. Others become factors
     :return: the hash of the new dataset
     :raises ValueError: if there is no such dataset, or it does not fit
     :raises ImportError: without Minari, naming the command that installs it
@@ -111,10 +139,10 @@ def import_dataset(dataset_id: str, folder: str | Path) -> str:
     folder = Path(folder)
     check_folder(folder)
     storage, metadata = _open_storage(dataset_id)
-    identity = _identity(dataset_id, storage, metadata)
-    channels_last = identity["source"]["channels_last"]
+    layout = recorded_layout(storage.observation_space, image_key, f"Minari dataset {dataset_id}")
+    identity = _identity(dataset_id, storage, metadata, layout, env_id)
     episodes = storage.get_episodes(range(storage.total_episodes))
-    segments = (_segment(episode, identity, channels_last) for episode in episodes)
+    segments = (_segment(episode, identity, layout) for episode in episodes)
     return write_segments(folder, _verified(segments, dataset_id, metadata), identity)
 
 
@@ -199,48 +227,119 @@ def _open_storage(dataset_id: str) -> tuple[Any, dict[str, Any]]:
     return MinariStorage.read(path), metadata
 
 
-def _identity(dataset_id: str, storage: Any, metadata: dict[str, Any]) -> dict[str, Any]:
-    ours = metadata.get(METADATA_KEY)
-    observation_space = storage.observation_space
-    shape = observation_space.shape or ()
-    if not isinstance(observation_space, spaces.Box) or observation_space.dtype != np.uint8 or len(shape) != 3:
-        raise ValueError(
-            f"Minari dataset {dataset_id} has observations {observation_space}; only uint8 images can be imported"
-        )
-    channels_last = not is_channels_first(shape)
-    if channels_last:
-        if int(np.argmin(shape)) != 2:
-            raise ValueError(f"observations of shape {shape} are neither channels first nor channels last")
-        observation_space = _move_channels(observation_space, -1, 0)
-    check_spaces(observation_space, storage.action_space)
-    if storage.jpeg_encoding and _is_jpeg(storage.observation_space):
-        warnings.warn(f"Minari dataset {dataset_id} holds JPEG images: not what the environment showed", stacklevel=3)
-    source = {"minari": dataset_id, "channels_last": channels_last}
-    identity = {
+def _identity(
+    dataset_id: str, storage: Any, metadata: dict[str, Any], layout: ImageLayout, env_id: str | None
+) -> dict[str, Any]:
+    check_spaces(layout.space, storage.action_space)
+    source: dict[str, Any] = {
+        "minari": dataset_id,
+        CHANNELS_KEY: layout.channels,
+        LOSSY_KEY: _lossy(dataset_id, storage, layout),
+        LEFT_OUT_KEY: ["rewards", *unread_keys(storage.observation_space, layout)],
+    }
+    identity: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
-        "observation_space": space_to_json(observation_space),
+        "env_id": None,
+        "observation_space": space_to_json(layout.space),
         "action_space": space_to_json(storage.action_space),
         "source": source,
-        "env_id": _recorded_env_id(metadata) or dataset_id,
         "env_kwargs": {},
-        "factors": {},
+        "factors": describe_factors({name: np.zeros((1, *shape), d) for name, (d, shape) in layout.layouts.items()}),
         CONTENT_HASH_KEY: None,
         "policy": "unknown",
         "seed": None,
         "n_envs": None,
         "steps_per_shard": None,
     }
-    if ours is not None:
-        if (
-            not isinstance(ours, dict)
-            or not set(IDENTITY_KEYS) <= ours.keys()
-            or ours["format_version"] not in (FORMAT_VERSION, RENDERED_FORMAT_VERSION, CHAINED_FORMAT_VERSION)
-        ):
-            raise ValueError(f"Minari dataset {dataset_id} was exported by another version of sb3_abisim")
-        check_factor_layout(ours["factors"])
+    if METADATA_KEY in metadata:
+        ours = _our_block(dataset_id, metadata)
         identity |= {key: ours[key] for key in ("env_id", "env_kwargs", "factors", CONTENT_HASH_KEY, "policy", "seed")}
         source["collected"] = {key: ours[key] for key in ("n_envs", "steps_per_shard")}
+    elif isinstance(metadata.get("combined_datasets"), list):
+        parts = source["combined"] = [str(part) for part in metadata["combined_datasets"]]
+        agreed = _recorded_env(metadata) | _agreed(parts)
+        identity |= agreed
+        _warn_of_lost(dataset_id, [key for key in ("env_id", "env_kwargs") if key not in agreed], env_id)
+        common, others = _factors_of_episodes(storage)
+        identity["factors"] |= common
+        source[LEFT_OUT_KEY] += [f"factor {name!r}, not alike in all episodes" for name in others]
+    identity["env_id"] = env_id or identity["env_id"] or _recorded_env(metadata).get("env_id") or dataset_id
     return identity
+
+
+def _warn_of_lost(dataset_id: str, lost: list[str], env_id: str | None) -> None:
+    if env_id is None and lost:
+        what = "id and arguments" if "env_id" in lost else "arguments"
+        warnings.warn(
+            f"the {what} of the environment are lost: Minari dataset {dataset_id} combines others, which are not in "
+            "the store or do not agree on them; name it with --env ID, or download what it combines",
+            stacklevel=4,
+        )
+
+
+def _our_block(dataset_id: str, metadata: dict[str, Any]) -> dict[str, Any]:
+    """What an export of ours has written, checked."""
+    ours = metadata[METADATA_KEY]
+    if (
+        not isinstance(ours, dict)
+        or not set(IDENTITY_KEYS) <= ours.keys()
+        or ours["format_version"] not in (FORMAT_VERSION, RENDERED_FORMAT_VERSION, CHAINED_FORMAT_VERSION)
+    ):
+        raise ValueError(f"Minari dataset {dataset_id} was exported by another version of sb3_abisim")
+    check_factor_layout(ours["factors"])
+    return ours
+
+
+def _agreed(parts: list[str]) -> dict[str, Any]:
+    """What the blocks of combined datasets, and of those that they combine, agree on; empty if one is not there."""
+    from minari.dataset.minari_storage import MinariStorage
+    from minari.storage.datasets_root_dir import get_dataset_path
+
+    blocks, waiting, seen = [], list(parts), set()
+    while waiting:
+        part = waiting.pop()
+        if part in seen:
+            continue
+        seen.add(part)
+        try:
+            _check_id(part)
+        except ValueError:
+            return {}  # a forged one, which could lead out of the store
+        path = get_dataset_path(part) / "data"
+        metadata = MinariStorage.read_raw_metadata(path) if path.is_dir() else {}
+        if METADATA_KEY in metadata:
+            blocks.append(_our_block(part, metadata))
+        elif isinstance(metadata.get("combined_datasets"), list):
+            waiting += [str(other) for other in metadata["combined_datasets"]]
+        else:
+            return {}
+    keys = ("env_id", "env_kwargs", CONTENT_HASH_KEY, "policy") if blocks else ()
+    return {key: blocks[0][key] for key in keys if all(block[key] == blocks[0][key] for block in blocks)}
+
+
+def _factors_of_episodes(storage: Any) -> tuple[dict[str, Any], list[str]]:
+    """The factors that all episodes have alike, and the names of others.
+
+    Whoever combined datasets kept them, but not what announced them.
+    """
+    layouts = []
+    for episode in storage.get_episodes(range(storage.total_episodes)):
+        rows = (episode["infos"] or {}).get(FACTORS_KEY)
+        n = len(episode["terminations"]) + 1
+        rows = rows if isinstance(rows, dict) else {}
+        layouts.append(describe_factors({k: v for k, v in rows.items() if isinstance(v, np.ndarray) and len(v) == n}))
+    names = sorted({name for layout in layouts for name in layout})
+    common = [name for name in names if all(name in one and one[name] == layouts[0].get(name) for one in layouts)]
+    return {name: layouts[0][name] for name in common}, [name for name in names if name not in common]
+
+
+def _lossy(dataset_id: str, storage: Any, layout: ImageLayout) -> str | None:
+    """What altered the observations before the import; None for nothing."""
+    space = storage.observation_space
+    if not (storage.jpeg_encoding and _is_jpeg(space if layout.key is None else space[layout.key])):
+        return None
+    warnings.warn(f"Minari dataset {dataset_id} holds JPEG images: not what the environment showed", stacklevel=4)
+    return "JPEG images"
 
 
 def _is_jpeg(space: spaces.Box) -> bool:
@@ -249,23 +348,26 @@ def _is_jpeg(space: spaces.Box) -> bool:
     return bool(is_image_space(space))
 
 
-def _recorded_env_id(metadata: dict[str, Any]) -> str | None:
-    """The environment's id as a piece of text; nothing is made from it."""
+def _recorded_env(metadata: dict[str, Any]) -> dict[str, Any]:
+    """The environment's id and arguments as pieces of text; nothing is made from them."""
     try:
-        return str(json.loads(metadata["env_spec"])["id"])
+        spec = json.loads(metadata["env_spec"])
+        return {"env_id": str(spec["id"]), "env_kwargs": dict(spec["kwargs"])}
     except (KeyError, ValueError, TypeError):
-        return None
+        return {}
 
 
-def _segment(episode: dict[str, Any], identity: dict[str, Any], channels_last: bool) -> Segment:
+def _segment(episode: dict[str, Any], identity: dict[str, Any], layout: ImageLayout) -> Segment:
     where = f"episode {episode['id']} of Minari dataset {identity['source']['minari']}"
-    observations, terminations, truncations = (
-        np.asarray(episode[key]) for key in ("observations", "terminations", "truncations")
-    )
+    terminations, truncations = (np.asarray(episode[key]) for key in ("terminations", "truncations"))
+    try:
+        frames, factors = layout.images(episode["observations"]), layout.rests(episode["observations"])
+    except (ValueError, KeyError) as error:
+        raise ValueError(f"{where}: {error}") from None
     n = len(terminations)
-    if n < 1 or len(observations) != n + 1 or len(truncations) != n or len(episode["actions"]) != n:
+    if n < 1 or len(frames) != n + 1 or len(truncations) != n or len(episode["actions"]) != n:
         raise ValueError(
-            f"{where} has {len(observations)} observations, {len(episode['actions'])} actions and {n} terminations; "
+            f"{where} has {len(frames)} observations, {len(episode['actions'])} actions and {n} terminations; "
             "n transitions need n + 1 observations"
         )
     if (terminations | truncations)[:-1].any():
@@ -277,8 +379,11 @@ def _segment(episode: dict[str, Any], identity: dict[str, Any], channels_last: b
         end = TRUNCATED
     else:
         end = CUT
-    factors = {name: _factor(infos, name, layout, where) for name, layout in identity["factors"].items()}
-    frames = np.moveaxis(observations, -1, 1) if channels_last else observations
+    factors |= {
+        name: _factor(infos, name, row, where)
+        for name, row in identity["factors"].items()
+        if name not in layout.factors
+    }
     actions = fit_actions(episode["actions"], space_from_json(identity["action_space"]), where)
     return Segment(frames, actions, end, factors)
 

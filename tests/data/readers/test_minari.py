@@ -15,6 +15,7 @@ from sb3_abisim.data.collect import collect
 from sb3_abisim.data.command import main
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED
+from sb3_abisim.data.importing import import_report
 from sb3_abisim.data.readers import minari as reader_module
 from sb3_abisim.data.readers.minari import export_dataset, import_dataset
 
@@ -97,6 +98,8 @@ def test_round_trip_is_lossless(ours: Path, tmp_path: Path) -> None:
     assert (after.env_id, after.env_kwargs) == ("IndexEnv-v0", {})
     assert (after.meta["seed"], after.meta["policy"]) == (3, "uniform")
     assert after.meta["source"]["minari"] == "index/random-v0"
+    import_dataset("index/random-v0", tmp_path / "named", env_id="Else-v0")
+    assert TransitionDataset(tmp_path / "named").env_id == "Else-v0"
 
 
 def test_frames_large_enough_for_jpeg_stay_exact(tmp_path: Path) -> None:
@@ -150,6 +153,76 @@ def test_channels_last_is_transposed_and_back(tmp_path: Path) -> None:
     assert np.array_equal(next(iter(minari.load_dataset("hwc-v1"))).observations, frames)
     import_dataset("hwc-v1", tmp_path / "again")
     assert_same_data(dataset, TransitionDataset(tmp_path / "again"))
+
+
+def test_gray_without_channels(tmp_path: Path) -> None:
+    frames = make_frames(4, (6, 5))
+    make_minari("gray-v0", [episode(frames, terminated=True)], gym.spaces.Box(0, 255, (6, 5), np.uint8))
+    import_dataset("gray-v0", tmp_path / "d")
+    dataset = TransitionDataset(tmp_path / "d")
+    assert np.array_equal(dataset.frames(np.arange(4)), frames[:, None])
+    assert "gray without channels in the source" in import_report(tmp_path / "d")
+
+
+def test_images_that_lie_in_no_known_way_are_refused(tmp_path: Path) -> None:
+    make_minari("odd-v0", [episode(make_frames(4, (6, 3, 5)))], gym.spaces.Box(0, 255, (6, 3, 5), np.uint8))
+    with pytest.raises(ValueError, match="neither channels first nor channels last"):
+        import_dataset("odd-v0", tmp_path / "d")
+
+
+@pytest.fixture
+def of_dicts(tmp_path: Path) -> list[dict]:
+    """A dataset of two cameras, a vector, a number and a word."""
+    shape = (40, 48, 3)
+    space = gym.spaces.Dict(
+        front=gym.spaces.Box(0, 255, shape, np.uint8),
+        wrist=gym.spaces.Box(0, 255, (3, 6, 5), np.uint8),
+        **{"arm.state": gym.spaces.Box(-9, 9, (2,), np.float32)},
+        gear=gym.spaces.Discrete(5),
+        task=gym.spaces.Text(9),
+    )
+    episodes = [
+        {
+            "front": make_frames(4, shape, i),
+            "wrist": make_frames(4, (3, 6, 5), i),
+            "arm.state": np.float32([[t, i] for t in range(4)]),
+            "gear": np.arange(4) + i,
+            "task": ["lift"] * 4,
+        }
+        for i in (0, 1)
+    ]
+    made = [episode(np.zeros(4), terminated=True, observations=observations) for observations in episodes]
+    make_minari("dict-v0", made, space, jpeg_encoding=False)
+    make_minari("lossy-v0", made, space)
+    return episodes
+
+
+def test_a_dict_of_observations_gives_one_image_and_factors(of_dicts: list[dict], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"Minari dataset dict-v0: .*2 images \(front, wrist\).*--image-key"):
+        import_dataset("dict-v0", tmp_path / "none")
+    for key in ("front", "wrist"):
+        main(["import", "minari", "dict-v0", "-o", str(tmp_path / key), "--image-key", key])
+        dataset = TransitionDataset(tmp_path / key, eval_fraction=0.0)
+        shown = np.concatenate([one[key] for one in of_dicts])
+        everything = np.arange(8)
+        assert np.array_equal(dataset.frames(everything), np.moveaxis(shown, -1, 1) if key == "front" else shown)
+        factors = dataset.factors(everything)
+        assert np.array_equal(factors["arm_state"], np.concatenate([one["arm.state"] for one in of_dicts]))
+        assert factors["gear"].tolist() == [0, 1, 2, 3, 1, 2, 3, 4]
+        assert dataset.meta["source"]["left_out"] == ["rewards", "observations 'task'"]
+    assert set(factors) == {"arm_state", "gear", "front"}
+    # What is exported is what the dataset holds: the image and the factors.
+    export_dataset(tmp_path / "front", "front-v0")
+    import_dataset("front-v0", tmp_path / "again")
+    assert_same_data(TransitionDataset(tmp_path / "front"), TransitionDataset(tmp_path / "again"))
+
+
+def test_jpeg_counts_for_the_image_that_is_chosen(of_dicts: list[dict], tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="lossy-v0 holds JPEG images"):
+        import_dataset("lossy-v0", tmp_path / "front", image_key="front")
+    assert "lossy         yes, JPEG images" in import_report(tmp_path / "front")
+    import_dataset("lossy-v0", tmp_path / "wrist", image_key="wrist")
+    assert "lossy         no" in import_report(tmp_path / "wrist")
 
 
 def test_ends_and_continuous_actions_of_a_foreign_dataset(tmp_path: Path) -> None:
@@ -304,7 +377,7 @@ def test_commands(ours: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["import", "minari", "index/random-v0", "-o", str(tmp_path / "back")], "already holds"),
         (["import", "minari", "absent-v0", "-o", str(tmp_path / "d")], "minari download absent-v0"),
         (["import", "minari", "index/random-v0", "-o", str(ours)], "begun with other arguments"),
-        (["import", "hdf4", "index/random-v0", "-o", str(tmp_path / "d")], "unknown reader 'hdf4'; known are minari"),
+        (["import", "hdf4", "index/random-v0", "-o", str(tmp_path / "d")], "unknown reader 'hdf4'; known are arrays"),
     ):
         with pytest.raises(SystemExit) as exit_info:
             main(arguments)
