@@ -167,17 +167,22 @@ def test_a_function_that_makes_a_vectorized_environment_goes_on(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("make_fn", [make_vec_env, make_vector_env])
-def test_a_ready_environment_is_collected_from_in_one_pass(tmp_path: Path, make_fn: Any) -> None:
+def test_a_ready_environment_is_collected_from_in_one_pass(
+    tmp_path: Path, make_fn: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed: list[Any] = []
+    monkeypatch.setattr(index_env.PlainEnv, "close", lambda self: closed.append(self))
+    collect(make_fn, 100, tmp_path / "made", seed=2)
+    assert len(closed) == N_ENVS
+    closed.clear()
     env = make_fn()
     collect(env, 100, tmp_path / "d", seed=2)
+    assert not closed
     dataset = TransitionDataset(tmp_path / "d")
     assert_episodes(dataset)
     # One chain: all that goes on in the next shard is known to.
     assert dataset.meta["shards_per_chain"] == 9 == len(dataset.meta["shards"])
     assert dataset.meta["source"] == {"one_pass": dataset.preprocessing["vec_env"]}
-    # It is still open.
-    env.reset()
-    env.step(np.stack([env.action_space.sample()] * N_ENVS) if make_fn is make_vec_env else env.action_space.sample())
     # What cannot be stepped to again is refused, whether finished or not.
     for _ in range(2):
         before = tree(tmp_path / "d")
