@@ -146,7 +146,7 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     except TypeError as error:
         raise ValueError(f"{name} does not take these arguments: {error}") from error
     if not isinstance(module, Encoder):
-        module = Encoder(module, _features_dim(name, module, shape), name, kwargs, shape)
+        module = Encoder(module, find_features_dim(name, module, shape), name, kwargs, shape)
     # SB3 turns observations into float32, whatever torch's default is.
     encoder: Encoder = module.float()
     if shape != encoder.input_shape:
@@ -190,8 +190,14 @@ def require_size(name: str, observation_space: gym.Space[Any], size: int) -> tup
     return n_channels, height, width
 
 
-def _features_dim(name: str, module: nn.Module, shape: tuple[int, ...]) -> int:
-    """Size of a module's output, found out by a forward pass that changes nothing in it."""
+def find_features_dim(name: str, module: nn.Module, shape: tuple[int, ...]) -> int:
+    """Size of a module's output, found out by a forward pass that changes nothing in it.
+
+    :param name: of the network, for messages
+    :param module: from float images (batch, channels, height, width) to (batch, features_dim)
+    :param shape: (channels, height, width)
+    :raises ValueError: if it does not take them, or gives something else
+    """
     tensor = next(iter((*module.parameters(), *module.buffers())), th.zeros(()))
     mode = module.training
     try:
