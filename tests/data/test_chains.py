@@ -255,7 +255,11 @@ def test_the_default_number_of_copies_is_that_of_the_folder(tmp_path: Path) -> N
 
 
 def test_a_function_makes_the_environment(tmp_path: Path) -> None:
+    LongEnv.n_made = 0
     collect(LongEnv, 60, tmp_path / "d", n_envs=2)
+    assert LongEnv.n_made == 2
+    collect(LongEnv, 60, tmp_path / "workers", n_envs=2, n_workers=2)
+    assert tree(tmp_path / "workers") == tree(tmp_path / "d")
     dataset = TransitionDataset(tmp_path / "d")
     assert dataset.env_id == f"{__name__}:LongEnv" and dataset.n_transitions == 60
     assert set(itertools.chain(dataset.ends.tolist())) >= {INSIDE, CUT}
