@@ -61,6 +61,7 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_frozen
 	$(BIN)/python -m benchmarks.bench_scan_nav
 	$(BIN)/python -m benchmarks.bench_malloc
+	$(BIN)/python -m benchmarks.bench_collect
 
 figures: setup  ## make every figure of docs/figures.md again from the committed encoders; about a quarter of an hour
 	$(BIN)/sb3-abisim analyze all --images docs/images --numbers benchmarks/results

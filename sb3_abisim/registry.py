@@ -158,6 +158,8 @@ class _Records(Generic[RecordT]):
 _METHODS: _Records[Method] = _Records("method", "sb3_abisim.objectives")
 _NETWORKS: _Records[Network] = _Records("network", "sb3_abisim.networks")
 _IMPORTED_NETWORKS: dict[str, Network] = {}
+# Networks that another library knows by name: FAMILY/MEMBER.
+_NETWORK_FAMILIES: _Records[Callable[..., Any]] = _Records("family of networks", "sb3_abisim.networks")
 _READERS: _Records[Reader] = _Records("reader", "sb3_abisim.data.readers")
 _TRAITS: dict[str, EnvTraits] = {}
 _DEFAULT_TRAITS = EnvTraits()
@@ -211,6 +213,18 @@ def register_network(
     :raises ValueError: for a name that is taken or cannot be one
     """
     _NETWORKS.add(name, Network(name, factory, observation_shape))
+
+
+def register_network_family(name: str, factory: Callable[..., Any]) -> None:
+    """Add the networks that another library knows by name, as ``name/MEMBER``.
+
+    An encoder file may name any member, so that the factory must not load or run what a name says.
+
+    :param name: before the slash
+    :param factory: as for :func:`register_network`, with the member's name as first argument
+    :raises ValueError: for a name that is taken or cannot be one
+    """
+    _NETWORK_FAMILIES.add(name, factory)
 
 
 def register_reader(name: str, read_fn: Callable[..., str], *, help: str = "") -> None:
@@ -274,7 +288,19 @@ def get_network(name: str) -> Network:
     :param name: e.g. "nature"
     :raises ValueError: for an unknown one, naming those that are known
     """
+    family, slash, member = name.partition("/")
+    if slash and not is_import_path(name):
+        return Network(name, functools.partial(_NETWORK_FAMILIES.get(family), member), None)
     return _IMPORTED_NETWORKS.get(name) or _NETWORKS.get(name)
+
+
+def is_known_network(name: str) -> bool:
+    """Whether a network's name is registered, or that of a member of a registered family.
+
+    :param name: of a network
+    """
+    family, slash, _ = name.partition("/")
+    return name in networks() or (bool(slash) and family in _NETWORK_FAMILIES.all())
 
 
 def is_import_path(name: str | None) -> bool:

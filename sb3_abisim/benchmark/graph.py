@@ -35,6 +35,12 @@ def build(plan: Plan) -> list[Job]:
     :raises ValueError: for an unknown method or setting, or an environment without hyperparameters
     """
     jobs: dict[str, Job] = {}
+    for word in plan.pretrain_params:
+        if word.startswith("base."):
+            raise ValueError(
+                f"--pretrain-params {word}: here base encoders are jobs of their own; give the method's name in "
+                "place of base, such as ssi"
+            )
 
     def add(job: Job) -> None:
         for source in job.inputs:

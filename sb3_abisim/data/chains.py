@@ -12,13 +12,19 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 
 from sb3_abisim.common.spaces import space_to_json
 from sb3_abisim.data.copies import FIRST, EnvCopies
-from sb3_abisim.data.environments import Preprocessing, content_hash, describe_preprocessing, name_of, time_limit
+from sb3_abisim.data.environments import (
+    VEC_ENV_KEY,
+    Preprocessing,
+    content_hash,
+    describe_preprocessing,
+    name_of,
+    time_limit,
+)
 from sb3_abisim.data.format import (
     CHAINED_FORMAT_VERSION,
     CONTENT_HASH_KEY,
@@ -45,64 +51,68 @@ class ShardSource:
     """Where shards come from: environments, and how far they are in a chain of shards.
 
     :param make_fn: makes the environments
-    :param env_id: see :func:`~sb3_abisim.data.collect.collect`
+    :param env: see :func:`~sb3_abisim.data.collect.collect`
     :param env_kwargs: see :func:`~sb3_abisim.data.collect.collect`
     :param seed: see :func:`~sb3_abisim.data.collect.collect`
     :param there: what the folder was begun with, empty for a new one
     :param preprocessing: see :class:`~sb3_abisim.data.environments.Preprocessing`
     :param policy: see :func:`~sb3_abisim.data.collect.collect`
+    :param one_pass: for what cannot be made again, the size of the dataset, which is one chain; else None
     """
 
     def __init__(
         self,
         make_fn: Callable[[], VectorEnv[Any, Any, Any]],
-        env_id: str | Callable[[], gym.Env[Any, Any]],
+        env: Any,
         env_kwargs: dict[str, Any],
         seed: int,
         there: dict[str, Any],
         preprocessing: Preprocessing,
         policy: Policy | None,
+        one_pass: int | None = None,
     ) -> None:
         self._policy, self._frame_stack = policy, preprocessing.frame_stack
         self._make_fn, self._seed = make_fn, seed
-        self.env = env = make_fn()
-        observation_space, action_space = env.single_observation_space, env.single_action_space
+        self.env = made = make_fn()
+        observation_space, action_space = made.single_observation_space, made.single_action_space
         check_spaces(observation_space, action_space)
-        if isinstance(env.unwrapped, BatchEnv):
-            env.reset(seed=seed)  # factors need a state; every chain resets again
-        limit = time_limit(env_id, env_kwargs)
-        channels = env.layout.channels if isinstance(env, EnvCopies) else FIRST
-        described = describe_preprocessing(preprocessing, channels, env)
+        if isinstance(made.unwrapped, BatchEnv):
+            made.reset(seed=seed)  # factors need a state; every chain resets again
+        limit = time_limit(env, env_kwargs)
+        channels = made.layout.channels if isinstance(made, EnvCopies) else FIRST
+        described = describe_preprocessing(preprocessing, channels, made)
         # Datasets of before, and batches whose shards of whole time limits fit into memory.
         old = there.get("format_version") in (FORMAT_VERSION, RENDERED_FORMAT_VERSION) and not described
-        whole = old or (isinstance(env.unwrapped, BatchEnv) and _fits(env, limit))
+        whole = old or (isinstance(made.unwrapped, BatchEnv) and _fits(made, limit))
         if whole:
-            self.steps, self.shards_per_chain = _steps_of_whole_limits(env, env_id, limit), 1
+            self.steps, self.shards_per_chain = _steps_of_whole_limits(made, env, limit), 1
         else:
-            self.steps, self.shards_per_chain = _steps_of_chain(env, limit)
+            self.steps, self.shards_per_chain = _steps_of_chain(made, limit)
+        if one_pass is not None:
+            self.shards_per_chain = -(-one_pass // (self.steps * made.num_envs))
         version = FORMAT_VERSION
-        if renders_factors(env):
+        if renders_factors(made):
             version = RENDERED_FORMAT_VERSION
         if not whole or described:
             version = CHAINED_FORMAT_VERSION
-        if version == CHAINED_FORMAT_VERSION and renders_factors(env):
+        if version == CHAINED_FORMAT_VERSION and renders_factors(made):
             raise ValueError(
-                f"{env_id} renders its observations from factors, in shards of whole time limits; leave frame_stack "
+                f"{env} renders its observations from factors, in shards of whole time limits; leave frame_stack "
                 "and env_wrapper out, and use fewer n_envs if its episodes do not fit into memory"
             )
         self.identity = {
             "format_version": version,
-            "env_id": env_id if isinstance(env_id, str) else name_of(env_id),
+            "env_id": name_of(env, made),
             "env_kwargs": env_kwargs,
             "observation_space": space_to_json(observation_space),
             "action_space": space_to_json(action_space),
-            "factors": describe_factors(factors_of(env)),
-            CONTENT_HASH_KEY: content_hash(env),
+            "factors": describe_factors(factors_of(made)),
+            CONTENT_HASH_KEY: content_hash(made),
             "policy": "uniform" if policy is None else f"{policy.name}, epsilon {policy.epsilon:g}",
             "seed": seed,
-            "n_envs": env.num_envs,
+            "n_envs": made.num_envs,
             "steps_per_shard": self.steps,
-            "source": None,
+            "source": None if one_pass is None else {"one_pass": described[VEC_ENV_KEY]},
         }
         if version == CHAINED_FORMAT_VERSION:
             self.identity |= {"shards_per_chain": self.shards_per_chain, "preprocessing": described}
@@ -110,12 +120,19 @@ class ShardSource:
         self._rollout: Rollout | None = None
         self._next = 0
 
-    def shard(self, k: int, n_transitions: int, advanced: Callable[[int], object]) -> list[Segment]:
-        """The segments of shard k; those before it in its chain are stepped through again where need be.
+    def shard(
+        self,
+        k: int,
+        n_transitions: int,
+        advanced: Callable[[int], object],
+        skips: Callable[[int], object] = lambda n: None,
+    ) -> list[Segment]:
+        """The segments of shard k; those before it in its chain are stepped through again where need be, once.
 
-        :param k: number of the shard
+        :param k: number of the shard, never below that of the call before
         :param n_transitions: how many of its transitions to keep
         :param advanced: called with the number of transitions gained
+        :param skips: called before steps are taken again, with the number of their transitions
         """
         chain, position = divmod(k, self.shards_per_chain)
         first = k - position
@@ -128,8 +145,10 @@ class ShardSource:
             self._rollout = Rollout(self.env, chain_seed, self._policy, self._frame_stack)
             self._next = first
         per_shard = self.steps * self.env.num_envs
+        if self._next < k:
+            skips((k - self._next) * per_shard)
         while self._next < k:
-            self._rollout.advance(self.steps, per_shard, lambda n: None)
+            self._rollout.skip(self.steps)
             self._next += 1
         segments = self._rollout.advance(self.steps, n_transitions, advanced)
         self._next += 1

@@ -8,19 +8,32 @@ import argparse
 import errno
 import functools
 import json
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+from gymnasium.vector import VectorEnv
 
 from sb3_abisim.common.cli import make_parser, parse_pairs, parse_value, run
 from sb3_abisim.data.chains import ShardSource
-from sb3_abisim.data.environments import N_BATCHED, N_COPIES, Preprocessing, make_vector_env, resolve_wrapper
+from sb3_abisim.data.environments import (
+    N_BATCHED,
+    N_COPIES,
+    Preprocessing,
+    as_made_or_reason,
+    make_vector_env,
+    resolve_wrapper,
+)
 from sb3_abisim.data.format import CONFIG_NAME, TERMINATED, TRUNCATED, DatasetError, from_json_file
 from sb3_abisim.data.rollout import Policy
+from sb3_abisim.data.vectorized import is_vectorized
 from sb3_abisim.data.writer import check_folder, open_writer
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 __all__ = ["Policy", "collect", "main"]
 
@@ -29,7 +42,7 @@ PolicyFn = Callable[[str, float], Policy]
 
 
 def collect(
-    env_id: str | Callable[[], gym.Env[Any, Any]],
+    env_id: "str | Callable[..., Any] | VectorEnv[Any, Any, Any] | VecEnv",
     n_transitions: int,
     folder: str | Path,
     *,
@@ -45,12 +58,14 @@ def collect(
 ) -> str:
     """Collect transitions; go on where an earlier call was stopped.
 
-    :param env_id: a registered id, or a function that makes one environment
+    :param env_id: a registered id; or a function that makes one environment, a ``VectorEnv`` or a ``VecEnv`` of
+        Stable-Baselines3; or one of the latter two, which stays open and is collected from in one pass: the folder must
+        be new
     :param n_transitions: size of the dataset, at least 1; a larger one than before extends it
     :param folder: new, empty, or begun with the same arguments
     :param seed: at least 0
     :param n_envs: environments stepped together; part of what determines the data. None for those of the folder, else
-        64 of an environment that runs as one batch, and 8 of another
+        64 of an environment that runs as one batch, and 8 of another; a vectorized environment has its own number
     :param env_kwargs: passed to the environment, JSON types
     :param env_wrapper: wrappers of the environment as in a zoo YAML: dotted paths, with or without arguments
     :param frame_stack: observations that readers of the dataset show together, as ``VecFrameStack`` does; each is
@@ -85,14 +100,34 @@ def collect(
     wrapper = None if env_wrapper is None else resolve_wrapper(env_wrapper)
     preprocessing = Preprocessing(frame_stack, image_key, env_wrapper, wrapper)
     there = _identity_of(folder)
-    if n_envs is None:
+    is_object = is_vectorized(env_id)
+    if is_object:
+        _check_one_pass(folder, env_id, env_kwargs)
+    elif n_envs is None:
         n_envs = there.get("n_envs")
-    make_fn = functools.partial(make_vector_env, env_id, n_envs, env_kwargs, preprocessing, n_workers)
-    source = ShardSource(make_fn, env_id, env_kwargs, seed, there, preprocessing, policy)
+    as_made = False
+    if isinstance(env_id, str):
+        as_made, reason = as_made_or_reason(env_id, env_kwargs, preprocessing)
+        if progress and reason:
+            print(f"{env_id} steps as single environments, not as its vector environment: {reason}", file=sys.stderr)
+    make_fn = functools.partial(make_vector_env, env_id, n_envs, env_kwargs, preprocessing, n_workers, as_made)
+    one_pass = n_transitions if is_object else None
+    source = ShardSource(make_fn, env_id, env_kwargs, seed, there, preprocessing, policy, one_pass)
     try:
         return _collect(source, n_transitions, folder, progress)
     finally:
         source.env.close()
+
+
+def _check_one_pass(folder: Path, env: Any, env_kwargs: dict[str, Any]) -> None:
+    """Refuse what needs an environment to be made again, where one is given that is there already."""
+    if (folder / CONFIG_NAME).exists():
+        raise ValueError(
+            f"{folder} was begun before, and {env} cannot be made again to step to where that ended; remove the folder "
+            "or name a new one, or give a function that makes the environment"
+        )
+    if env_kwargs:
+        raise ValueError(f"env_kwargs {env_kwargs} come too late for {env}, which is there already; leave them out")
 
 
 def _identity_of(folder: Path) -> dict[str, Any]:
@@ -124,7 +159,11 @@ def _collect(source: ShardSource, n_transitions: int, folder: Path, progress: bo
                 bar.update(size)
                 bar.initial = getattr(bar, "initial", 0) + size  # keeps the rate that of new transitions
                 continue
-            writer.write_shard(k, source.shard(k, size, bar.update))
+            segments = source.shard(
+                k, size, bar.update, lambda n: bar.set_postfix_str(f"stepping through {n} before them again")
+            )
+            bar.set_postfix_str("", refresh=False)
+            writer.write_shard(k, segments)
             written += 1
         hash = writer.finish(n_shards)
         ends = writer.count_ends(n_shards)

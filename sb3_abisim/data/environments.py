@@ -4,18 +4,23 @@ import difflib
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
 from sb3_abisim.data.copies import FIRST, EnvCopies, WorkerCopies
+from sb3_abisim.data.vectorized import VectorizedCopies, difference, is_vectorized
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.envs.base import batch_class
 
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
+
 # Environments stepped together by default: those that run as one batch, and others.
 N_BATCHED, N_COPIES = 64, 8
-
+# Key of recorded preprocessing: the classes of a vectorized environment that the zoo cannot make.
+VEC_ENV_KEY = "vec_env"
 
 Wrapper = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 
@@ -37,49 +42,99 @@ class Preprocessing:
 
 
 def make_vector_env(
-    env_id: str | Callable[[], gym.Env[Any, Any]],
+    env: "str | Callable[..., Any] | VectorEnv[Any, Any, Any] | VecEnv",
     n_envs: int | None,
     env_kwargs: dict[str, Any],
     preprocessing: Preprocessing | None = None,
     n_workers: int = 1,
+    as_made: bool = False,
 ) -> VectorEnv[Any, Any, Any]:
     """Copies of an environment that reset within the step that ends an episode.
 
-    :param env_id: a registered one, or a function that makes one environment; what is no
-        :class:`~sb3_abisim.envs.base.BatchEnv`, or is wrapped, runs as :class:`~sb3_abisim.data.copies.EnvCopies`
+    :param env: a registered id, a function that makes one environment or a vectorized one, or a vectorized one that is
+        there; what is no :class:`~sb3_abisim.envs.base.BatchEnv`, or is wrapped, runs as
+        :class:`~sb3_abisim.data.copies.EnvCopies`
     :param n_envs: number of copies; None for the default
     :param env_kwargs: passed to the environment
     :param preprocessing: what stands between the environment and its observations; None for nothing
     :param n_workers: processes that step copies, unless they run as one batch
+    :param as_made: whether an id steps as its ``vector_entry_point``, see :func:`as_made_or_reason`
     :raises ValueError: for an unknown id, or if the environment refuses ``env_kwargs``
     """
-    wrapper = None if preprocessing is None else preprocessing.wrapper
-    image_key = None if preprocessing is None else preprocessing.image_key
-    if isinstance(env_id, str):
-        spec = gym.registry.get(env_id)
-        if spec is None:
-            close = difflib.get_close_matches(env_id, gym.registry, n=3)
-            hint = f"did you mean {' or '.join(close)}?" if close else f"known are {', '.join(ENV_IDS)}"
-            raise ValueError(f"unknown environment {env_id!r}: {hint} (--packages imports what registers others)")
-        make_fn = functools.partial(_make_one, functools.partial(gym.make, spec, **env_kwargs), wrapper)
-    else:
-        make_fn = functools.partial(_make_one, functools.partial(env_id, **env_kwargs), wrapper)
+    preprocessing = Preprocessing() if preprocessing is None else preprocessing
+    wrapper, image_key = preprocessing.wrapper, preprocessing.image_key
+    is_plain = wrapper is None and image_key is None
+    if is_vectorized(env):
+        return _vectorized(env, n_envs, preprocessing, owned=False)
+    make_fn = _make_fn(env, env_kwargs)
     try:
-        if isinstance(env_id, str) and batch_class(env_id) is not None and wrapper is None and image_key is None:
-            return gym.make_vec(env_id, n_envs or N_BATCHED, "vector_entry_point", **env_kwargs)
-        make_fns = [make_fn] * (n_envs or N_COPIES)
+        if isinstance(env, str) and is_plain and batch_class(env) is not None:
+            return gym.make_vec(env, n_envs or N_BATCHED, "vector_entry_point", **env_kwargs)
+        if isinstance(env, str) and as_made:
+            whole = gym.make_vec(env, n_envs or N_COPIES, "vector_entry_point", **env_kwargs)
+            return VectorizedCopies(whole, like_single=True)
+        make_fns = [functools.partial(_wrapped, make_fn, wrapper)] * (n_envs or N_COPIES)
+        if not isinstance(env, str):
+            # Only what it makes says what it is.
+            made = make_fn()
+            if is_vectorized(made):
+                return _vectorized(made, n_envs, preprocessing, owned=True)
+            if n_workers > 1:
+                made.close()  # workers make their own
+            else:
+                make_fns[0] = functools.partial(_wrapped, lambda: made, wrapper)
         return EnvCopies(make_fns, image_key) if n_workers == 1 else WorkerCopies(make_fns, image_key, n_workers)
     except ValueError as error:
-        if wrapper is None or preprocessing is None:
+        if wrapper is None:
             raise
         raise ValueError(
             f"{error} (with env_wrapper {preprocessing.env_wrapper}; --env-wrapper takes the place of the zoo's)"
         ) from error
     except (TypeError, OSError, gym.error.Error) as error:
-        raise ValueError(f"cannot make {env_id} with {env_kwargs}: {error}") from error
+        raise ValueError(f"cannot make {env} with {env_kwargs}: {error}") from error
 
 
-def _make_one(make_fn: Callable[[], gym.Env[Any, Any]], wrapper: Wrapper | None) -> gym.Env[Any, Any]:
+def as_made_or_reason(env_id: str, env_kwargs: dict[str, Any], preprocessing: Preprocessing) -> tuple[bool, str]:
+    """Whether an id steps as its ``vector_entry_point``, as the environments of this package always do.
+
+    :param env_id: any id
+    :param env_kwargs: passed to the environment
+    :param preprocessing: what stands between the environment and its observations
+    :return: whether it does, and else why it does not; no reason for an id that has none
+    """
+    spec = gym.registry.get(env_id)
+    if spec is None or spec.vector_entry_point is None or spec.entry_point is None or batch_class(env_id) is not None:
+        return False, ""
+    if preprocessing.wrapper is not None or preprocessing.image_key is not None:
+        return False, "env_wrapper and image_key apply to single environments"
+    make_vec_fn = functools.partial(gym.make_vec, env_id, vectorization_mode="vector_entry_point", **env_kwargs)
+    reason = difference(make_vec_fn, _make_fn(env_id, env_kwargs))
+    return reason is None, reason or ""
+
+
+def _make_fn(env: Any, env_kwargs: dict[str, Any]) -> Callable[[], Any]:
+    if not isinstance(env, str):
+        return functools.partial(env, **env_kwargs)
+    spec = gym.registry.get(env)
+    if spec is None:
+        close = difflib.get_close_matches(env, gym.registry, n=3)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"known are {', '.join(ENV_IDS)}"
+        raise ValueError(f"unknown environment {env!r}: {hint} (--packages imports what registers others)")
+    return functools.partial(gym.make, spec, **env_kwargs)
+
+
+def _vectorized(env: Any, n_envs: int | None, preprocessing: Preprocessing, owned: bool) -> VectorizedCopies:
+    if n_envs not in (None, env.num_envs):
+        raise ValueError(f"{env} has {env.num_envs} copies, not n_envs {n_envs}; leave n_envs out")
+    if preprocessing.wrapper is not None:
+        raise ValueError(
+            f"env_wrapper {preprocessing.env_wrapper} wraps single environments, and {env} is vectorized; wrap the "
+            "environments in it before, and leave env_wrapper out"
+        )
+    return VectorizedCopies(env, preprocessing.image_key, owned=owned)
+
+
+def _wrapped(make_fn: Callable[[], gym.Env[Any, Any]], wrapper: Wrapper | None) -> gym.Env[Any, Any]:
     env = make_fn()
     return env if wrapper is None else wrapper(env)
 
@@ -118,11 +173,22 @@ def describe_preprocessing(
         described["env_wrapper"] = preprocessing.env_wrapper
     if isinstance(env, EnvCopies) and env.layout.key is not None:
         described["image_key"] = env.layout.key
+    if isinstance(env, VectorizedCopies) and not env.like_single:
+        described[VEC_ENV_KEY] = env.class_paths
     return described
 
 
-def name_of(make_fn: Callable[[], gym.Env[Any, Any]]) -> str:
-    return f"{make_fn.__module__}:{getattr(make_fn, '__qualname__', type(make_fn).__qualname__)}"
+def name_of(env: Any, made: VectorEnv[Any, Any, Any]) -> str:
+    """How a dataset calls its environment: its id if it has one.
+
+    :param env: see :func:`make_vector_env`
+    :param made: what that has made of it
+    """
+    if isinstance(env, str):
+        return env
+    if isinstance(made, VectorizedCopies):
+        return made.class_paths[-1] if made.spec is None else str(made.spec.id)
+    return f"{env.__module__}:{getattr(env, '__qualname__', type(env).__qualname__)}"
 
 
 def content_hash(env: VectorEnv[Any, Any, Any]) -> str | None:
@@ -131,8 +197,8 @@ def content_hash(env: VectorEnv[Any, Any, Any]) -> str | None:
     return None if value is None else str(value)
 
 
-def time_limit(env_id: str | Callable[[], gym.Env[Any, Any]], env_kwargs: dict[str, Any]) -> int:
+def time_limit(env: Any, env_kwargs: dict[str, Any]) -> int:
     """Steps of an episode at most; 0 for no limit that Gymnasium knows."""
-    registered = gym.registry[env_id].max_episode_steps if isinstance(env_id, str) else None
+    registered = gym.registry[env].max_episode_steps if isinstance(env, str) else None
     # -1 is Gymnasium's word for none; it refuses other numbers below 1.
     return max(0, int(env_kwargs.get("max_episode_steps") or registered or 0))

@@ -91,24 +91,42 @@ class Rollout:
         self._stack[done] = 0
         self._stack[:, -1] = self._observation
 
+    def _sample(self, n_steps: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Random actions of the next steps, and which of them the policy replaces."""
+        size = n_steps, self._env.num_envs
+        actions = sample_actions(self._env.single_action_space, size, self._generator)
+        if self._policy is None:
+            return actions, np.zeros(size, bool)
+        return actions, self._generator.random(size) >= self._policy.epsilon
+
+    def _step(self, actions: NDArray[Any], by_policy: NDArray[np.bool_]) -> tuple[Any, Any, dict[str, Any]]:
+        """One step of every copy; how episodes ended, and infos."""
+        self._choose(actions, by_policy)
+        self._observation, _, terminated, truncated, infos = self._env.step(actions)
+        if self._policy is not None:
+            self._push(terminated | truncated)
+        return terminated, truncated, infos
+
+    def skip(self, n_steps: int) -> None:
+        """Step as :meth:`advance` does with as many steps, and keep nothing.
+
+        :param n_steps: of every copy
+        """
+        for actions, by_policy in zip(*self._sample(n_steps), strict=True):
+            self._step(actions, by_policy)
+
     def advance(self, n_steps: int, n_transitions: int, advanced: Callable[[int], object]) -> list[Segment]:
         """The next ``n_steps`` of every copy as segments, copy after copy; see :func:`collect_shard`."""
         env, n_envs = self._env, self._env.num_envs
         kept = n_transitions // n_envs + (np.arange(n_envs) < n_transitions % n_envs)
-        actions = sample_actions(env.single_action_space, (n_steps, n_envs), self._generator)
-        by_policy = np.zeros((n_steps, n_envs), bool)
-        if self._policy is not None:
-            by_policy = self._generator.random((n_steps, n_envs)) >= self._policy.epsilon
+        actions, by_policy = self._sample(n_steps)
         # Frames that can be rendered again are not kept.
         rendered = renders_factors(env)
         observations, factors = [] if rendered else [self._observation], [factors_of(env)]
         # Per copy: (steps taken at the episode's end, how it ended, last frame, last factors).
         endings: list[list[_Ending]] = [[] for _ in range(n_envs)]
         for t in range(kept.max()):
-            self._choose(actions[t], by_policy[t])
-            self._observation, _, terminated, truncated, infos = env.step(actions[t])
-            if self._policy is not None:
-                self._push(terminated | truncated)
+            terminated, truncated, infos = self._step(actions[t], by_policy[t])
             if not rendered:
                 observations.append(self._observation)
             factors.append(factors_of(env))

@@ -78,7 +78,7 @@ class Encoder(nn.Module):
         # Only what differs from the plain network is named, so that equal networks have equal specs.
         plain = {"features": "embedding", "hidden_dim": None}
         self._network_kwargs |= {name: value for name, value in top.items() if value != plain[name]}
-        self.features_dim = _features_dim(self._name, self.layers, self.input_shape)
+        self.features_dim = find_features_dim(self._name, self.layers, self.input_shape)
         self.offset = th.zeros(self.features_dim)
         set_memory_format(self, th.channels_last)
 
@@ -177,7 +177,7 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     except TypeError as error:
         raise ValueError(f"{name} does not take these arguments: {error}") from error
     if not isinstance(module, Encoder):
-        module = Encoder(module, _features_dim(name, module, shape), name, own_kwargs, shape)
+        module = Encoder(module, find_features_dim(name, module, shape), name, own_kwargs, shape)
     # SB3 turns observations into float32, whatever torch's default is.
     encoder: Encoder = module.float()
     if shape != encoder.input_shape:
@@ -223,8 +223,14 @@ def require_size(name: str, observation_space: gym.Space[Any], size: int) -> tup
     return n_channels, height, width
 
 
-def _features_dim(name: str, module: nn.Module, shape: tuple[int, ...]) -> int:
-    """Size of a module's output, found out by a forward pass that changes nothing in it."""
+def find_features_dim(name: str, module: nn.Module, shape: tuple[int, ...]) -> int:
+    """Size of a module's output, found out by a forward pass that changes nothing in it.
+
+    :param name: of the network, for messages
+    :param module: from float images (batch, channels, height, width) to (batch, features_dim)
+    :param shape: (channels, height, width)
+    :raises ValueError: if it does not take them, or gives something else
+    """
     tensor = next(iter((*module.parameters(), *module.buffers())), th.zeros(()))
     mode = module.training
     try:

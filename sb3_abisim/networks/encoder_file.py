@@ -33,7 +33,7 @@ from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.spaces import space_to_json
 from sb3_abisim.common.vocabulary import current_env_kwargs, current_settings
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess
-from sb3_abisim.registry import import_network, is_import_path, networks
+from sb3_abisim.registry import import_network, is_import_path, is_known_network, networks
 
 FORMAT = 1
 # The embeddings of the reference batch may differ by this fraction of the largest one (other machine, other torch).
@@ -339,7 +339,7 @@ def _require_registered(path: Path, name: Any) -> None:
             f"{path} names the network {name!r}, which is imported only if you name it. If you trust it, add "
             f"--packages {name} to the command, or network={name!r} in Python"
         )
-    if name not in networks():
+    if not is_known_network(name):
         raise EncoderFileError(
             f"{path} names the network {name!r}, which is not registered; known are {', '.join(networks())}. If you "
             "trust the package that registers it, name it with --packages on the command line, or import it"

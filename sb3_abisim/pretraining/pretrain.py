@@ -18,6 +18,9 @@ from sb3_abisim.common.cli import make_parser, parse_pairs, run
 from sb3_abisim.pretraining.config import PretrainConfig, load_config
 from sb3_abisim.registry import get_method, get_objective
 
+# In front of settings of the base encoder.
+_BASE = "base."
+
 if TYPE_CHECKING:
     from sb3_abisim.data.dataset import TransitionDataset
     from sb3_abisim.pretraining.trainer import Callback
@@ -42,7 +45,8 @@ def pretrain(
     :param data: a dataset's folder
     :param output: the encoder file, ending in ``.safetensors``; the model card is ``.json`` beside it
     :param config: settings that replace those of ``hyperparams/pretrain/`` for the dataset's environment, such as
-        ``{"n_updates": 1000, "objective_kwargs.c": 0.9}``; or all of them
+        ``{"n_updates": 1000, "objective_kwargs.c": 0.9}``; or all of them. Those that begin with ``base.``, such as
+        ``base.n_updates``, are for the base encoder that is pretrained first
     :param base: file or name of a base encoder, for an objective that builds on another method's, as "abisim" does on
         "ssi"; None pretrains it on the same data first, into ``<output without ending>.base.safetensors``
     :param seed: of weights and batches
@@ -74,7 +78,10 @@ def pretrain(
         raise ValueError(f"the output must end in .safetensors, got {output}")
     refuse_to_replace(output.with_suffix(".json"))
     env_id = read_env_id(Path(data))
+    base_settings: dict[str, Any] = {}
     if not isinstance(config, PretrainConfig):
+        config, base_settings = _split_base_settings(config or {})
+        _check_base_settings(base_settings, objective, base)
         config = load_config(objective, env_id, config)
     dataset = TransitionDataset(data, eval_fraction=config.eval_fraction)
     _check_parts(dataset, config)
@@ -85,13 +92,14 @@ def pretrain(
         stand_in = make_encoder(dataset.observation_space, config.network, **base_network_kwargs)
         make_objective(objective, dataset, config, stand_in)
         # Of the same network and data, whatever this one is asked to have.
-        base_config = load_config(base_method, env_id)
+        base_config = load_config(base_method, env_id, base_settings)
+        batch_size = base_config.batch_size
         base_config = dataclasses.replace(
             base_config,
             network=config.network,
             network_kwargs=base_network_kwargs,
             eval_fraction=config.eval_fraction,
-            batch_size=min(base_config.batch_size, config.batch_size),
+            batch_size=batch_size if "batch_size" in base_settings else min(batch_size, config.batch_size),
         )
         pretrain(base_method, data, base, base_config, None, seed, device, progress_bar, verbose)
     if base_method is None and base is not None:
@@ -113,6 +121,32 @@ def pretrain(
         if not any(folder.iterdir()):
             folder.rmdir()
     return output
+
+
+def _split_base_settings(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Tell the settings of an objective from those of its base encoder.
+
+    :param settings: by name; those of the base begin with ``base.``
+    :return: those of the objective, and those of the base without their prefix
+    """
+    own = {name: value for name, value in settings.items() if not name.startswith(_BASE)}
+    return own, {name.removeprefix(_BASE): value for name, value in settings.items() if name.startswith(_BASE)}
+
+
+def _check_base_settings(settings: dict[str, Any], objective: str, base: str | None) -> None:
+    """Refuse settings of a base encoder that would not hold."""
+    for name in settings:
+        if get_method(objective).base is None:
+            raise ValueError(f"{_BASE}{name} is for a base encoder, and {objective!r} builds on none; leave it out")
+        if base is not None:
+            raise ValueError(
+                f"{_BASE}{name} would not hold: the base encoder is there already, {base}; give one of the two"
+            )
+        if name.partition(".")[0] in ("network", "network_kwargs", "eval_fraction"):
+            raise ValueError(
+                f"{_BASE}{name} would not hold: the base has the network and the data of what builds on it; "
+                f"set {name}, or pretrain the base by itself and give it with --base"
+            )
 
 
 def _check_parts(dataset: "TransitionDataset", config: PretrainConfig) -> None:
@@ -170,7 +204,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--device", default="auto", help="as in Stable-Baselines3 (default: %(default)s)")
     parser.add_argument(
         "-params", "--params", nargs="+", action="extend", default=[], metavar="NAME:VALUE",
-        help="replace settings, such as n_updates:1000 objective_kwargs.c:0.9",
+        help="replace settings, such as n_updates:1000 objective_kwargs.c:0.9; base.n_updates:1000 for the base",
     )  # fmt: skip
     parser.add_argument(
         "--keep-checkpoint", action="store_true",
@@ -185,8 +219,8 @@ def _command(args: argparse.Namespace) -> None:
     env_id = read_env_id(data)
     if args.env is not None and env_id != args.env:
         raise ValueError(f"{data} was collected in {env_id}, not in {args.env}")
-    config = load_config(args.objective, env_id, parse_pairs(args.params, "-params"))
+    settings = parse_pairs(args.params, "-params")
     pretrain(
-        args.objective, data, args.output, config, args.base, args.seed, args.device,
+        args.objective, data, args.output, settings, args.base, args.seed, args.device,
         verbose=args.verbose, keep_checkpoint=args.keep_checkpoint,
     )  # fmt: skip

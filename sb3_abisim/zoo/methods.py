@@ -13,6 +13,7 @@ import yaml
 
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
+from sb3_abisim.data.environments import VEC_ENV_KEY
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.file_network import network_arguments
@@ -210,6 +211,11 @@ def check_preprocessing(file: EncoderFile, settings: Mapping[str, Any], frozen: 
     :raises ValueError: naming both sides
     """
     recorded = file.metadata["preprocessing"]
+    if VEC_ENV_KEY in recorded:
+        raise ValueError(
+            f"{file.path} was pretrained on what {' of '.join(recorded[VEC_ENV_KEY])} shows, which the zoo cannot "
+            "make; train in Python on such an environment, or collect by the environment's id and pretrain again"
+        )
     there = {"env_wrapper": _items(recorded.get("env_wrapper")), "frame_stack": recorded.get("frame_stack", 1)}
     here = {"env_wrapper": _items(settings.get("env_wrapper")), "frame_stack": settings.get("frame_stack") or 1}
     names = ["env_wrapper"] if frozen else ["env_wrapper", "frame_stack"]

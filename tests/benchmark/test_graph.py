@@ -206,6 +206,7 @@ def test_settings_that_nothing_else_would_miss(changes: dict[str, object]) -> No
         ({"params": ("dqn.learning_rat:1e-4",)}, "dqn has no hyperparameter 'learning_rat', only .*learning_rate"),
         ({"params": ("ppo.seed:3",)}, "--params seed would not hold; give --seeds"),
         ({"params": ("policy_kwargs:dict()",)}, "-params policy_kwargs would undo --conf-file"),
+        ({"pretrain_params": ("base.n_updates:3",)}, "base encoders are jobs of their own; give the method's name"),
         ({"pretrain_params": ("n_update:3",)}, "unknown pretraining setting n_update"),
     ],
 )

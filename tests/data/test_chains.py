@@ -17,7 +17,7 @@ from sb3_abisim.data import collect as collect_module
 from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, INSIDE, META_NAME, DatasetError
-from sb3_abisim.data.rollout import Policy
+from sb3_abisim.data.rollout import Policy, Rollout
 
 N_ENVS, STEPS, SHARDS = 3, 4, 5
 PER_SHARD, PER_CHAIN = N_ENVS * STEPS, N_ENVS * STEPS * SHARDS
@@ -26,7 +26,7 @@ PER_SHARD, PER_CHAIN = N_ENVS * STEPS, N_ENVS * STEPS * SHARDS
 class LongEnv(index_env.PlainEnv):
     """Episodes of 2 to about 30 steps, over several shards of a chain; what it did before shows after a reset."""
 
-    n_made = 0
+    n_made = n_steps = 0
 
     def __init__(self, channels_last: bool = False) -> None:
         super().__init__(channels_last)
@@ -39,6 +39,7 @@ class LongEnv(index_env.PlainEnv):
 
     def step(self, action: Any) -> Any:
         observation, reward, _, truncated, info = super().step(action)
+        type(self).n_steps += 1
         return observation, reward, bool(self.np_random.random() < 0.1), truncated, info
 
     def _observe(self) -> Any:
@@ -99,6 +100,41 @@ def test_grown_repaired_and_direct_are_the_same_bytes(tmp_path: Path, n: int) ->
             (tmp_path / "d" / name).unlink()
         collect_long(tmp_path / "d")
         assert tree(tmp_path / "d") == tree(tmp_path / "direct")
+
+
+@pytest.mark.parametrize(
+    ("missing", "n_shards"),
+    [
+        ([1, 3], 4),  # one pass through the chain for both, which ends after the last
+        ([0, 4], 5),
+        ([6, 8, 12], 4 + 3),  # chains of shards 5 to 9 and 10 to 12
+    ],
+)
+def test_missing_shards_of_a_chain_take_one_pass(
+    tmp_path: Path, missing: list[int], n_shards: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    n = 13 * PER_SHARD
+    collect_long(tmp_path / "d", n)
+    before = tree(tmp_path / "d")
+    for k in missing:
+        (tmp_path / "d" / f"shard-{k:05d}.json").unlink()
+    LongEnv.n_steps = 0
+    collect_long(tmp_path / "d", n, progress=True)
+    assert LongEnv.n_steps == n_shards * PER_SHARD
+    assert tree(tmp_path / "d") == before
+    again = [k - before - 1 for before, k in itertools.pairwise([missing[0] // SHARDS * SHARDS - 1, *missing])]
+    assert f"stepping through {again[0] * PER_SHARD} before them again" in capsys.readouterr().err or not again[0]
+
+
+def test_what_is_stepped_through_again_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    collect_long(tmp_path / "d", 4 * PER_SHARD)
+    before = tree(tmp_path / "d")
+    (tmp_path / "d" / "shard-00003.json").unlink()
+    kept = []
+    real = Rollout.advance
+    monkeypatch.setattr(Rollout, "advance", lambda self, *args: kept.append(args[1]) or real(self, *args))
+    collect_long(tmp_path / "d", 4 * PER_SHARD)
+    assert kept == [PER_SHARD] and tree(tmp_path / "d") == before
 
 
 @pytest.mark.parametrize("n_workers", [2, 7])
@@ -219,7 +255,11 @@ def test_the_default_number_of_copies_is_that_of_the_folder(tmp_path: Path) -> N
 
 
 def test_a_function_makes_the_environment(tmp_path: Path) -> None:
+    LongEnv.n_made = 0
     collect(LongEnv, 60, tmp_path / "d", n_envs=2)
+    assert LongEnv.n_made == 2
+    collect(LongEnv, 60, tmp_path / "workers", n_envs=2, n_workers=2)
+    assert tree(tmp_path / "workers") == tree(tmp_path / "d")
     dataset = TransitionDataset(tmp_path / "d")
     assert dataset.env_id == f"{__name__}:LongEnv" and dataset.n_transitions == 60
     assert set(itertools.chain(dataset.ends.tolist())) >= {INSIDE, CUT}

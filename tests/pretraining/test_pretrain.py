@@ -44,7 +44,7 @@ def test_settings_in_a_dictionary_replace_those_of_the_file(data, tmp_path):
 
 def test_abisim_trains_its_base_first(data, tmp_path, monkeypatch):
     small = load_config("ssi", "Nav2D-v0", SETTINGS)
-    monkeypatch.setattr("sb3_abisim.pretraining.pretrain.load_config", lambda objective, env_id: small)
+    monkeypatch.setattr("sb3_abisim.pretraining.pretrain.load_config", lambda *args: small)
     output = run(data, tmp_path / "abisim.safetensors", "abisim")
     base = load_encoder(str(tmp_path / "abisim.base.safetensors"))
     metadata = load_encoder(str(output)).metadata
@@ -70,12 +70,42 @@ def test_no_updates_make_the_control_of_an_encoder(data, tmp_path):
 
 
 def test_a_base_made_on_the_way_has_the_network_asked_for(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "sb3_abisim.pretraining.pretrain.load_config", lambda objective, env_id: PretrainConfig(**SETTINGS)
-    )
+    monkeypatch.setattr("sb3_abisim.pretraining.pretrain.load_config", lambda *args: PretrainConfig(**SETTINGS))
     output = run(data, tmp_path / "abisim.safetensors", "abisim", **{"network_kwargs.features_dim": 18})
     base = load_encoder(str(tmp_path / "abisim.base.safetensors"))
     assert base.encoder.features_dim == load_encoder(str(output)).encoder.features_dim == 18
+
+
+def test_settings_of_a_base_made_on_the_way(data, tmp_path):
+    settings = {**SETTINGS, "base.n_updates": 3, "base.objective_kwargs.l1_penalty": 0.25}
+    settings |= {"base.batch_size": 40, "base.log_interval": 1, "base.checkpoint_interval": 1}
+    quiet = {"device": "cpu", "progress_bar": False, "verbose": 0}
+    output = pretrain("abisim", data, tmp_path / "abisim.safetensors", settings, **quiet)
+    base = load_encoder(tmp_path / "abisim.base.safetensors").metadata["settings"]
+    assert (base["n_updates"], base["batch_size"]) == (3, 40)
+    assert base["objective_kwargs"]["l1_penalty"] == 0.25
+    assert load_encoder(output).metadata["settings"]["n_updates"] == SETTINGS["n_updates"]
+    # The same again does nothing, others are refused.
+    pretrain("abisim", data, output, settings, **quiet)
+    with pytest.raises(ValueError, match=r"n_updates"):
+        pretrain("abisim", data, output, {**settings, "base.n_updates": 4}, **quiet)
+
+
+@pytest.mark.parametrize(
+    ("objective", "base", "setting", "message"),
+    [
+        ("ssi", None, "base.n_updates", "base.n_updates is for a base encoder, and 'ssi' builds on none"),
+        ("abisim", "b.safetensors", "base.n_updates", "the base encoder is there already, b.safetensors"),
+        ("abisim", None, "base.network_kwargs.features_dim", "base has the network .* set network_kwargs.features_dim"),
+        ("abisim", None, "base.eval_fraction", "set eval_fraction, or pretrain the base by itself"),
+        ("abisim", None, "base.n_update", "unknown pretraining setting n_update; known are"),
+        ("goal_progress", None, "base.base.n_updates", "unknown pretraining setting base; known are"),
+    ],
+)
+def test_settings_that_would_not_hold_for_a_base_are_refused(data, tmp_path, objective, base, setting, message):
+    with pytest.raises(ValueError, match=message):
+        pretrain(objective, data, tmp_path / "a.safetensors", {**SETTINGS, setting: 3}, base=base, device="cpu")
+    assert not list(tmp_path.iterdir())
 
 
 def test_mistakes_are_found_before_the_base_is_trained(data, tmp_path):
