@@ -35,20 +35,18 @@ from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
-from sb3_abisim.rl.checks import check_trained_with, find_extractors
-from sb3_abisim.rl.extractors import BaseEncoderExtractor, method_of
+from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
+from sb3_abisim.rl.extractors import method_of
 from sb3_abisim.zoo.methods import (
-    PREPROCESSING_KEYS,
     MethodRecord,
     MethodSpec,
-    check_preprocessing,
     encoding_kwargs,
     hyperparameters_entry,
     hyperparameters_file,
-    normalizes_observations,
     resolve_classes,
     zoo_hyperparams,
 )
+from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
 exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
@@ -158,22 +156,25 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             file = load_encoder(encoding["encoder"])
             check_preprocessing(file, self._used, frozen=True)
             return MethodRecord(file.metadata["objective"], True, str(encoding["encoder"]), file.hash, preprocessing)
-        extractor = self._policy_kwargs.get("features_extractor_class")
-        if not (isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor)):
+        extractor: Any = self._policy_kwargs.get("features_extractor_class")
+        if not is_extractor(extractor):
             return MethodRecord(None, False, None, None, preprocessing)
         kwargs = self._policy_kwargs.get("features_extractor_kwargs") or {}
-        encoder, hash, method = kwargs.get("encoder"), None, method_of(extractor)
-        if encoder is not None:
+        method = method_of(extractor)
+        names, hashes = [], []
+        for encoder, network in encoders_of(extractor, kwargs):
+            names.append(str(encoder))
             try:
-                file = load_encoder(encoder, kwargs.get("network"))
+                file = load_encoder(encoder, network)
                 check_preprocessing(file, self._used)
-                hash, method = file.hash, method or str(file.metadata["objective"])
+                hashes.append(file.hash)
+                method = method or str(file.metadata["objective"])
             except EncoderNotFoundError:
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
-        name = None if encoder is None else str(encoder)
-        return MethodRecord(method, bool(kwargs.get("freeze", False)), name, hash, preprocessing)
+        frozen = bool(kwargs.get("freeze", False))
+        return MethodRecord(method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does.
@@ -208,7 +209,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     def hyperparameters_optimization(self) -> None:
         """As rl-zoo3 does, except that an extractor of ours survives a trial's ``policy_kwargs``."""
         extractor = (self._hyperparams.get("policy_kwargs") or {}).get("features_extractor_class")
-        if isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor):
+        if is_extractor(extractor):
             self._hyperparams = _KeepExtractor(self._hyperparams)
         MethodExperimentManager.has_begun = True
         super().hyperparameters_optimization()

@@ -178,7 +178,7 @@ def test_from_channels_last_to_an_agent(tmp_path: Path, frame_stack: int) -> Non
         _register_stacked()
     path = pretrain("ssi", tmp_path / "d", tmp_path / "e.safetensors", config, progress_bar=False, verbose=0)
     file = load_encoder(path)
-    expected = {"channels": "last"} | ({"frame_stack": frame_stack} if frame_stack > 1 else {})
+    expected = {"channels": "last", "env_wrapper": []} | ({"frame_stack": frame_stack} if frame_stack > 1 else {})
     assert file.metadata["preprocessing"] == expected
     assert file.metadata["observation_space"]["shape"] == [3 * frame_stack, HEIGHT, WIDTH]
     venv = DummyVecEnv([lambda: gym.make("Forms-v0")])
