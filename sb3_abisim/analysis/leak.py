@@ -10,6 +10,7 @@ encoder: it can be run before pretraining.
 import itertools
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -18,7 +19,10 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.scenes import sample_episodes
+from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.objectives.actions import actions_of
+from sb3_abisim.zoo.collect import preprocessing_entry
+from sb3_abisim.zoo.preprocessing import recorded_preprocessing
 
 # A score (0 chance, 1 certainty) from which one patch alone counts as a leak.
 THRESHOLD = 0.5
@@ -155,16 +159,42 @@ def leak_maps(env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:
     :param env_id: a registered id
     :param n_episodes: of random play, :data:`PER_EPISODE` transitions of each
     :param seed: of the episodes
+    :raises ValueError: for an environment that shows no images as the zoo's entry of its id wraps it
     """
-    samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed)
-    actions, space = samples.actions, samples.env.single_action_space
-    plain = audit(samples.obs, actions, samples.next_obs, space)
+    entry = preprocessing_entry(env_id)
+    shown = recorded_preprocessing(entry, f"the zoo's entry of {env_id}")
+    try:
+        samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, entry.get("env_kwargs"), shown)
+    except ValueError as error:
+        raise ValueError(f"{error}; or audit what sb3-abisim collect has made of it: --data DIR") from error
+    return _both_audits(samples.obs, samples.actions, samples.next_obs, samples.env.single_action_space)
+
+
+def leak_maps_of_data(path: str | Path, n_episodes: int, seed: int = 0) -> dict[str, Any]:
+    """As :func:`leak_maps`, on transitions of a dataset.
+
+    :param path: a dataset's folder
+    :param n_episodes: :data:`PER_EPISODE` transitions for each
+    :param seed: of the choice
+    """
+    dataset = TransitionDataset(path)
+    starts = dataset.valid_starts()
+    n = min(len(starts), n_episodes * PER_EPISODE)
+    starts = np.random.default_rng(seed).choice(starts, n, replace=False)
+    obs, next_obs = dataset.frames(starts), dataset.frames(starts + 1)
+    return _both_audits(obs, dataset.actions(starts), next_obs, dataset.action_space)
+
+
+def _both_audits(
+    obs: NDArray[np.uint8], actions: NDArray[Any], next_obs: NDArray[np.uint8], space: gym.Space[Any]
+) -> dict[str, Any]:
+    plain = audit(obs, actions, next_obs, space)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ActionLeakWarning)
-        display = audit(samples.obs, actions, paint_action(samples.next_obs, actions, space), space)
+        display = audit(obs, actions, paint_action(next_obs, actions, space), space)
     audits = {"as it is": plain, "with a display of the action": display}
     return {
-        "n_transitions": len(samples),
+        "n_transitions": len(obs),
         "threshold": THRESHOLD,
         "audits": {
             name: {"scores": one.scores.tolist(), "best": one.best, "patch": one.patch, "leaks": one.leaks}

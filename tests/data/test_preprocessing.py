@@ -161,6 +161,8 @@ def test_the_zoo_entry_of_an_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     main([*words, str(tmp_path / "e"), "--frame-stack", "1", "--env-kwargs", "form:first"])
     dataset = TransitionDataset(tmp_path / "e")
     assert dataset.preprocessing == {"env_wrapper": [DARKEN]}
+    main([*words, str(tmp_path / "f"), "--frame-stack", "1", "--env-wrapper", "none"])
+    assert TransitionDataset(tmp_path / "f").preprocessing == {"channels": "last"}
     with pytest.raises(ValueError, match="has no entry Other-v0, only Forms-v0"):
         preprocessing_entry("Other-v0", str(mine))
 
