@@ -9,7 +9,8 @@ import index_env  # noqa: F401  (registers the environment)
 import pytest
 
 from sb3_abisim.common.files import file_hash
-from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data import chains
+from sb3_abisim.data.collect import collect
 from sb3_abisim.data.format import META_NAME, make_meta
 
 N = 420
@@ -18,8 +19,8 @@ N = 420
 def collect_index(path: Path) -> Path:
     """Nine shards of a few dozen frames each."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collect_module, "SHARD_TRANSITIONS", 48)
-        collect_module.collect("IndexEnv-v0", N, path, n_envs=4, seed=3)
+        patch.setattr(chains, "SHARD_TRANSITIONS", 48)
+        collect("IndexEnv-v0", N, path, n_envs=4, seed=3)
     return path
 
 

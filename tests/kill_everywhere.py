@@ -16,7 +16,8 @@ from typing import Any
 import tqdm  # noqa: F401  here once instead of in every child
 from dataset_inputs import tree
 
-from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data import chains
+from sb3_abisim.data.collect import collect
 
 CALLS = ("fsync", "replace", "unlink", "posix_fallocate", "mkdir", "ftruncate")
 
@@ -43,7 +44,7 @@ def run(folder: str, n: int, kill_at: int | None = None) -> int:
     for name in CALLS:
         setattr(os, name, counted(name, getattr(os, name)))
     try:
-        collect_module.collect("IndexEnv-v0", n, folder, n_envs=4, seed=3)
+        collect("IndexEnv-v0", n, folder, n_envs=4, seed=3)
     except BaseException as error:
         print(f"raised {error!r} after {n_calls} calls", flush=True)
         os._exit(1)
@@ -51,7 +52,7 @@ def run(folder: str, n: int, kill_at: int | None = None) -> int:
 
 
 def main(work: str, first: int, then: int, stride: int) -> None:
-    collect_module.SHARD_TRANSITIONS = 48
+    chains.SHARD_TRANSITIONS = 48
     reference, folder = os.path.join(work, "reference"), os.path.join(work, "killed")
     assert run(reference, then) == 0
     expected = tree(reference)

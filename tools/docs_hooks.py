@@ -20,11 +20,11 @@ LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 MODULES = (
     "registry", "common.cli", "envs.base", "envs.sb3_vec_env", "envs.nav2d", "envs.point_maze.env",
     "envs.point_maze.distractors", "envs.point_maze.pixel_wrapper", "envs.scan_nav.env", "envs.scan_nav.build",
-    "envs.scan_nav.map", "networks.base", "networks.paper", "networks.encoder_file", "data.collect", "data.dataset",
-    "data.writer", "data.readers.minari", "objectives.base", "objectives.abisim", "objectives.goal_progress",
-    "objectives.ssi", "objectives.acro",
-    "objectives.info_nce", "objectives.beta_vae", "objectives.curl", "pretraining.pretrain", "pretraining.config",
-    "pretraining.card", "rl.extractors", "rl.checks", "rl.vec_encode", "rl.merge", "rl.callbacks", "rl.optimizers",
+    "envs.scan_nav.map", "networks.base", "networks.paper", "networks.encoder_file", "data.collect", "data.rollout",
+    "data.dataset", "data.writer", "data.readers.minari", "objectives.base", "objectives.abisim",
+    "objectives.goal_progress", "objectives.ssi", "objectives.acro", "objectives.info_nce", "objectives.beta_vae",
+    "objectives.curl", "pretraining.pretrain", "pretraining.config", "pretraining.card", "rl.extractors",
+    "rl.extractor_classes", "rl.checks", "rl.vec_encode", "rl.merge", "rl.callbacks", "rl.optimizers",
     "zoo.methods", "zoo.manager", "zoo.runs", "zoo.evaluate", "zoo.record", "analysis.exact_metric",
     "analysis.nav2d_exact", "analysis.leak",
 )  # fmt: skip

@@ -15,7 +15,7 @@ from sb3_abisim.analysis import curves, leak, neighbors, perturbation, pixels, p
 from sb3_abisim.analysis.scenes import eval_settings, preprocessing_of
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.data.collect import Preprocessing, make_vector_env
+from sb3_abisim.data.environments import Preprocessing, make_vector_env
 from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
 from sb3_abisim.registry import get_traits
 

@@ -25,7 +25,7 @@ from sb3_abisim.analysis.nav2d_exact import (
     profile,
     reachable,
 )
-from sb3_abisim.data.collect import make_vector_env
+from sb3_abisim.data.environments import make_vector_env
 from sb3_abisim.envs.nav2d import LAYOUTS, OBSTACLE_SIZE, SIZE
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import EncoderFile

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import EVAL_SEED
-from sb3_abisim.data.collect import Preprocessing, collect_shard, make_vector_env
+from sb3_abisim.data.environments import Preprocessing, make_vector_env
 from sb3_abisim.data.format import check_spaces
+from sb3_abisim.data.rollout import collect_shard
 from sb3_abisim.envs.backgrounds.player import composite
 from sb3_abisim.envs.base import BatchEnv, batch_class
 from sb3_abisim.envs.nav2d import SIZE, Nav2DVectorEnv

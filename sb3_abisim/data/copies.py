@@ -25,6 +25,10 @@ from numpy.typing import NDArray
 from sb3_abisim.common.spaces import is_channels_first
 
 MakeFn = Callable[[], gym.Env[Any, Any]]
+_REMEDY = (
+    "a wrapper makes images: --env-wrapper gymnasium.wrappers.AddRenderObservation --env-kwargs render_mode:rgb_array "
+    "shows what the environment renders"
+)
 # Where the channels of an observation are: (C, H, W), (H, W, C) or (H, W).
 FIRST, LAST, NONE = "first", "last", "none"
 
@@ -59,9 +63,11 @@ class ImageLayout:
         if isinstance(space, spaces.Dict):
             images = [key for key, part in space.spaces.items() if _is_image(part)]
             if image_key is None and len(images) != 1:
+                if not images:
+                    raise ValueError(f"no observation of {space} is a uint8 image in 0..255; {_REMEDY}")
                 raise ValueError(
-                    f"the observations have {len(images)} images ({', '.join(images) or 'none'}) in {space}; choose one"
-                    " with --image-key" + ("" if images else ", made uint8 in 0..255 by a wrapper")
+                    f"the observations have {len(images)} images ({', '.join(images)}) in {space}; choose one with "
+                    "--image-key"
                 )
             image_key = images[0] if image_key is None else image_key
             if image_key not in images:
@@ -76,8 +82,7 @@ class ImageLayout:
         if not _is_image(space):
             raise ValueError(
                 "observations must be uint8 images in 0..255 of shape (channels, height, width), (height, width, "
-                f"channels) or (height, width), got {space}; a wrapper makes others into such "
-                "(gymnasium.wrappers.AddRenderObservation, TransformObservation), see --env-wrapper"
+                f"channels) or (height, width), got {space}; {_REMEDY}"
             )
         shape = space.shape
         assert shape is not None

@@ -415,7 +415,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 def _repair(path: Path, meta: dict[str, Any]) -> str:
     if meta["source"] is not None:
-        return f"remove {path} and import it again from its source, {meta['source']}"
+        return f"remove {path} and make it again from its source, {meta['source']}"
     return (
         "run the command that collected it again, which collects damaged shards anew: sb3-abisim collect "
         f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} "

@@ -169,13 +169,23 @@ class VectorEnvAdapter(VecEnv):
         """
         if any(options != self._options[0] for options in self._options):
             raise ValueError(f"the copies of a VectorEnv are reset with equal options, got {self._options}")
-        # Stable-Baselines3's seeds count up from the first, as those of a VectorEnv do.
-        observations, infos = self.env.reset(seed=self._seeds[0], options=dict(self._options[0]) or None)
+        # Stable-Baselines3's seeds count up from the first, as those of a VectorEnv do; not every one takes others.
+        seed: Any = self._seeds[0]
+        if seed is not None and self._seeds != [seed + i for i in range(self.num_envs)]:
+            seed = list(self._seeds)
+        observations, infos = self.env.reset(seed=seed, options=dict(self._options[0]) or None)
         self.reset_infos = [_info_row(infos, i, self.num_envs) for i in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         self._returns[:], self._lengths[:] = 0, 0
         return copy.deepcopy(observations)  # type: ignore[no-any-return]
+
+    def seed_each(self, seeds: Sequence[int]) -> None:
+        """Give every copy a seed of its own for the next reset; ``seed`` gives them consecutive ones.
+
+        :param seeds: one for each copy
+        """
+        self._seeds = list(seeds)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for :meth:`step_wait`.

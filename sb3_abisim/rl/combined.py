@@ -58,12 +58,6 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
             extractor: BaseFeaturesExtractor | None = None
             if key in encoders:
                 extractor = EncoderExtractor(space, encoders[key], freeze, **(networks or {}).get(key, {}))
-            elif not isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
-                kept = [name for name in observation_space.spaces if name != key]
-                raise ValueError(
-                    f"{key} of the observations is {type(space).__name__}, which has no numbers; leave it out by a "
-                    f"wrapper: env_wrapper gymnasium.wrappers.FilterObservation with filter_keys {kept}"
-                )
             elif key in without:
                 if min((space.shape or ())[1:]) < NATURE_SIZE:
                     raise ValueError(

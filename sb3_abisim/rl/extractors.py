@@ -1,6 +1,7 @@
 """Features extractors for Stable-Baselines3: a pretrained encoder behind ``features_extractor_class``.
 
-Each registered method has one, made by :func:`extractor_class` and importable by its name, such as ``SSIExtractor``.
+Each registered method has one (:func:`~sb3_abisim.rl.extractor_classes.extractor_class`), importable from here by its
+name, such as ``SSIExtractor``.
 
 What SB3 does to any extractor with its default settings, and where that is stopped here:
 
@@ -12,10 +13,6 @@ What SB3 does to any extractor with its default settings, and where that is stop
   ``weights_ready`` says whether weights have come since.
 """
 
-import copyreg
-import functools
-import inspect
-import json
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -25,10 +22,10 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_abisim.common.spaces import space_from_json
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
-from sb3_abisim.registry import Method, get_method, methods
+from sb3_abisim.rl.file_network import build_network, check_objective, read_network
+from sb3_abisim.rl.frozen_weights import buffers_to_parameters, parameters_to_buffers
 from sb3_abisim.rl.optimizers import mark_encoder
 
 
@@ -177,9 +174,9 @@ class PretrainedExtractor(BaseEncoderExtractor):
             if self.objective is not None:
                 check_objective(file, self.objective)
             else:
-                network, network_kwargs = _read_network(file, network, network_kwargs)
+                network, network_kwargs = read_network(file, network, network_kwargs)
             file.check(observation_space)
-        module = _build_network(observation_space, network, network_kwargs or {}, file)
+        module = build_network(observation_space, network, network_kwargs or {}, file)
         super().__init__(observation_space, module)
         self.source = encoder
         self.frozen = freeze
@@ -191,7 +188,7 @@ class PretrainedExtractor(BaseEncoderExtractor):
         self.register_buffer("weights_ready", th.tensor(file is not None, dtype=th.uint8))
         self.register_buffer("encoder_hash", th.tensor(list(hash), dtype=th.uint8))
         if freeze:
-            _parameters_to_buffers(self.encoder)
+            parameters_to_buffers(self.encoder)
             self.encoder.eval()
 
     @property
@@ -238,7 +235,7 @@ class PretrainedExtractor(BaseEncoderExtractor):
         """
         if not self.frozen:
             return []
-        parameters = _buffers_to_parameters(self.encoder, self._weight_names)
+        parameters = buffers_to_parameters(self.encoder, self._weight_names)
         self.frozen = False
         mark_encoder(self.encoder)
         self.encoder.train(self.training)
@@ -276,108 +273,6 @@ class EncoderExtractor(PretrainedExtractor):
     """
 
 
-def extractor_class(method: str) -> type[BaseEncoderExtractor]:
-    """The features extractor of a method, the same object at every call.
-
-    :param method: a registered name, e.g. "ssi"
-    :raises ValueError: for an unknown one
-    """
-    return _class_of(get_method(method))
-
-
-def method_of(extractor: type[BaseEncoderExtractor]) -> str | None:
-    """The name of the method whose features extractor a class is; None for one that belongs to none.
-
-    :param extractor: the class
-    """
-    return next((name for name, method in methods().items() if _is_class_of(method, extractor)), None)
-
-
-def network_arguments(file: EncoderFile) -> dict[str, Any]:
-    """What an extractor must be given beside ``encoder`` to take a file.
-
-    :param file: the encoder file
-    :return: ``network`` and ``network_kwargs``; nothing for the default network of the observation's shape
-    """
-    space = space_from_json(file.metadata["observation_space"])
-    try:
-        # The weights drawn here are thrown away; the caller's random numbers must not depend on that.
-        with th.random.fork_rng(devices=[]):
-            is_default = _json_spec(make_encoder(space)) == _json_spec(file.encoder)
-    except ValueError:
-        is_default = False
-    return {} if is_default else stored_network(file)
-
-
-def __getattr__(name: str) -> Any:
-    # The classes of methods, also for pickle, which finds a class by its module and name.
-    if name.endswith("Extractor"):
-        return _find_class(name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def _find_class(name: str, registered_by: str | None = None) -> type[BaseEncoderExtractor]:
-    """The features extractor of this name.
-
-    :param name: of the class
-    :param registered_by: the module that its method is expected to be registered by, None if that is not known
-    :raises ImportError: when no method has one. Not an ``AttributeError``, which ``load`` of SB3 turns into a warning
-    """
-    for method in methods().values():
-        if method.extractor == name:
-            return _class_of(method)
-    known = ", ".join(method.extractor for method in methods().values())
-    remedy = f"import {registered_by}" if registered_by else "import the package that registers its method"
-    flag = f"--packages {registered_by}" if registered_by else "--packages"
-    raise ImportError(
-        f"no method has a features extractor {name!r}, only {known}; {remedy} first ({flag} in a command)"
-    )
-
-
-def _is_class_of(method: Method, extractor: type) -> bool:
-    return method.extractor == extractor.__name__ and _class_of(method) is extractor
-
-
-@functools.cache
-def _class_of(method: Method) -> type[BaseEncoderExtractor]:
-    parent: type[BaseEncoderExtractor] = PretrainedExtractor if method.has_encoder_file else VanillaExtractor
-    if method.extractor == parent.__name__:
-        return parent
-    attributes: dict[str, Any] = {"__module__": __name__}
-    summary = f"The network without pretraining, for the method ``{method.name}``"
-    if method.has_encoder_file:
-        attributes["objective"] = method.name
-        summary = f"An encoder pretrained by {method.label} (``--objective {method.name}``)"
-        if method.trained_elsewhere:
-            summary = "An encoder trained elsewhere (:func:`~sb3_abisim.networks.from_module.from_module`)"
-    _, param, parameters = inspect.cleandoc(parent.__doc__ or "").partition(":param")
-    attributes["__doc__"] = f"{summary}.\n\n{param}{parameters}\n"
-    metaclass = type if _registered_by(method) is None else _ForeignType
-    return metaclass(method.extractor, (parent,), attributes)
-
-
-def _registered_by(method: Method) -> str | None:
-    """The module of another package that brings a method; None for a method of ours, or where it cannot be imported."""
-    module: str | None = getattr(method.objective, "__module__", None)
-    is_ours = module is not None and module.partition(".")[0] == __name__.partition(".")[0]
-    return None if is_ours or module == "__main__" else module
-
-
-class _ForeignType(type):
-    """The type of extractors of other packages' methods: a pickle of one says which module to import."""
-
-
-def _reduce_foreign(extractor: _ForeignType) -> Any:
-    for method in methods().values():
-        if _is_class_of(method, extractor):
-            return _find_class, (extractor.__name__, _registered_by(method))
-    # A subclass that somebody has written: by its module and name, as any class.
-    return extractor.__qualname__
-
-
-copyreg.pickle(_ForeignType, _reduce_foreign)
-
-
 def _check_space(observation_space: gym.Space[Any]) -> None:
     if isinstance(observation_space, spaces.Dict):
         raise ValueError(
@@ -390,83 +285,10 @@ def _check_space(observation_space: gym.Space[Any]) -> None:
         )
 
 
-def check_objective(file: EncoderFile, objective: str) -> None:
-    """Refuse an encoder that another objective has trained.
+def __getattr__(name: str) -> Any:
+    # The classes of methods, also for pickle, which finds a class by its module and name.
+    if name.endswith("Extractor"):
+        from sb3_abisim.rl.extractor_classes import find_extractor_class
 
-    :param file: the encoder file
-    :param objective: short name of the objective that is expected, e.g. "ssi"
-    :raises ValueError: with both sides
-    """
-    trained_by = file.metadata["objective"]
-    if trained_by != objective:
-        known = methods()
-        remedy = (
-            f"use {known[trained_by].extractor}"
-            if trained_by in known
-            else f"known methods are {', '.join(known)} (--packages imports what registers others)"
-        )
-        raise ValueError(f"{file.path} was trained by {trained_by!r}, not {objective!r}; {remedy}")
-
-
-def _build_network(
-    observation_space: gym.Space[Any], network: str | None, network_kwargs: dict[str, Any], file: EncoderFile | None
-) -> Encoder:
-    """The network that the arguments describe, with the file's weights if there is a file."""
-    if file is None:
-        return make_encoder(observation_space, network, **network_kwargs)
-    stored = _json_spec(file.encoder)
-    hint = f"pass network={stored['name']!r}, network_kwargs={stored['kwargs']} to the extractor"
-    try:
-        encoder = make_encoder(observation_space, network, **network_kwargs)
-    except ValueError as error:
-        raise ValueError(f"{error}; to use {file.path}, {hint}") from error
-    if _json_spec(encoder) != stored:
-        raise ValueError(f"{file.path} holds the network {stored}, the extractor builds {_json_spec(encoder)}; {hint}")
-    encoder.load_state_dict(file.encoder.state_dict())
-    return encoder
-
-
-def stored_network(file: EncoderFile) -> dict[str, Any]:
-    """The network of a file as arguments of an extractor.
-
-    :param file: the encoder file
-    :return: ``network`` and ``network_kwargs``
-    """
-    stored = _json_spec(file.encoder)
-    return {"network": stored["name"], "network_kwargs": stored["kwargs"]}
-
-
-def _read_network(
-    file: EncoderFile, network: str | None, network_kwargs: dict[str, Any] | None
-) -> tuple[str | None, dict[str, Any] | None]:
-    """The file's network where the arguments say nothing else."""
-    stored = _json_spec(file.encoder)
-    agree = network in (None, stored["name"]) and network_kwargs in (None, stored["kwargs"])
-    return (stored["name"], stored["kwargs"]) if agree else (network, network_kwargs)
-
-
-def _json_spec(encoder: Encoder) -> dict[str, Any]:
-    """The spec as a file gives it back (lists for tuples)."""
-    spec: dict[str, Any] = json.loads(json.dumps(encoder.spec()))
-    return spec
-
-
-def _parameters_to_buffers(module: nn.Module) -> None:
-    """Turn parameters into buffers: the same state dict, out of reach of whatever updates parameters."""
-    for submodule in module.modules():
-        for name, parameter in list(submodule.named_parameters(recurse=False)):
-            delattr(submodule, name)
-            submodule.register_buffer(name, parameter.detach().clone())
-
-
-def _buffers_to_parameters(module: nn.Module, names: list[str]) -> list[nn.Parameter]:
-    """The inverse, for weights of these names."""
-    parameters = []
-    for name in names:
-        path, _, attribute = name.rpartition(".")
-        submodule = module.get_submodule(path)
-        weights = submodule.get_buffer(attribute)
-        delattr(submodule, attribute)
-        parameters.append(nn.Parameter(weights.clone()))
-        submodule.register_parameter(attribute, parameters[-1])
-    return parameters
+        return find_extractor_class(name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,7 +12,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_set
 from sb3_abisim.common.cli import make_parser, run
 from sb3_abisim.common.spaces import space_from_json
 from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
-from sb3_abisim.rl.extractors import extractor_class
+from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.vec_encode import EncodedBox
 
 AlgorithmT = TypeVar("AlgorithmT", bound=BaseAlgorithm)

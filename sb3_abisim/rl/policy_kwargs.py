@@ -6,7 +6,8 @@ from typing import Any
 
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
-from sb3_abisim.rl.extractors import EncoderExtractor, stored_network
+from sb3_abisim.rl.extractors import EncoderExtractor
+from sb3_abisim.rl.file_network import stored_network
 
 _File = str | os.PathLike[str]
 

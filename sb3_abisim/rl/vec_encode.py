@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import embed, load_encoder
-from sb3_abisim.rl.extractors import check_objective
+from sb3_abisim.rl.file_network import check_objective
 
 
 class EncodedBox(spaces.Box):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.common.files import file_hash
-from sb3_abisim.data.collect import Policy
+from sb3_abisim.data.rollout import Policy
 from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.merge import merge_encoder
@@ -59,7 +59,7 @@ def model_policy(name: str, epsilon: float) -> Policy:
 
     :param name: folder of a zoo run, whose final model acts, or a model's ``.zip`` in it; models are unpickled, so they
         must be your own
-    :param epsilon: see :class:`~sb3_abisim.data.collect.Policy`
+    :param epsilon: see :class:`~sb3_abisim.data.rollout.Policy`
     :raises ValueError: if it is none, or was trained on something else than observations
     """
     from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]

@@ -16,7 +16,7 @@ from sb3_abisim.common.paths import resource_path
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
-from sb3_abisim.rl.extractors import check_objective, network_arguments, stored_network
+from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
 from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_stack_of, items
 
 ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
@@ -265,6 +265,26 @@ def hyperparameters_entry(algo: str, env_id: str) -> dict[str, Any]:
         if name in entries:
             return dict(entries[name])
     raise ValueError(f"rl-zoo3 has no hyperparameters of {algo} for {env_id}; choose another with --algo")
+
+
+def policy_of(algo: str, policy: str) -> str:
+    """The algorithm's policy of a kind, which rl-zoo3's default entry for RecurrentPPO calls as PPO does.
+
+    :param algo: rl-zoo3's name of the algorithm
+    :param policy: such as "MlpPolicy", or the dotted path of a custom one
+    :return: such as "MlpLstmPolicy"
+    :raises ValueError: when there is none
+    """
+    from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]
+
+    known = ALGOS[algo].policy_aliases
+    if "." in policy or policy in known:
+        return policy
+    kind = re.match("Cnn|Mlp|MultiInput", policy)
+    found = [name for name in known if kind is not None and name.startswith(kind[0])]
+    if len(found) != 1:
+        raise ValueError(f"{algo} has no policy {policy!r}, only {', '.join(known)}; choose another with --algo")
+    return str(found[0])
 
 
 def zoo_hyperparams() -> Path:

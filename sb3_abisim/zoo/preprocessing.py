@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.vec_env import VecMonitor, VecTransposeImage
 
-from sb3_abisim.data.collect import Preprocessing
+from sb3_abisim.data.environments import VEC_ENV_KEY, Preprocessing
 from sb3_abisim.networks.encoder_file import EncoderFile
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
@@ -58,6 +58,7 @@ def check_preprocessing(file: EncoderFile, settings: Mapping[str, Any], frozen: 
     :raises ValueError: naming both sides
     """
     recorded = file.metadata["preprocessing"]
+    _refuse_vec_env(recorded, str(file.path))
     there: dict[str, Any] = {"env_wrapper": items(recorded.get("env_wrapper")), "frame_stack": frame_stack_of(file)}
     here: dict[str, Any] = {name: settings.get(name) for name in there}
     here = {"env_wrapper": items(here["env_wrapper"]), "frame_stack": here["frame_stack"] or 1}
@@ -149,9 +150,18 @@ def recorded_preprocessing(recorded: Mapping[str, Any], where: str) -> Preproces
     :param where: the file, for messages
     :raises ValueError: as :func:`recorded_wrapper`
     """
+    _refuse_vec_env(recorded, where)
     return Preprocessing(
         frame_stack=recorded.get("frame_stack", 1),
         image_key=recorded.get("image_key"),
         env_wrapper=recorded.get("env_wrapper"),
         wrapper=recorded_wrapper(recorded.get("env_wrapper"), where=where),
     )
+
+
+def _refuse_vec_env(recorded: Mapping[str, Any], where: str) -> None:
+    if VEC_ENV_KEY in recorded:
+        raise ValueError(
+            f"{where} was pretrained on what {' of '.join(recorded[VEC_ENV_KEY])} shows, which the zoo cannot make; "
+            "train in Python on such an environment, or collect by the environment's id and pretrain again"
+        )

@@ -12,10 +12,12 @@ import pytest
 from dataset_inputs import rewrite_meta, tree
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecTransposeImage
 
+from sb3_abisim.data import chains, environments
 from sb3_abisim.data import collect as collect_module
-from sb3_abisim.data.collect import Policy, collect
+from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, INSIDE, META_NAME, DatasetError
+from sb3_abisim.data.rollout import Policy, Rollout
 
 N_ENVS, STEPS, SHARDS = 3, 4, 5
 PER_SHARD, PER_CHAIN = N_ENVS * STEPS, N_ENVS * STEPS * SHARDS
@@ -24,7 +26,7 @@ PER_SHARD, PER_CHAIN = N_ENVS * STEPS, N_ENVS * STEPS * SHARDS
 class LongEnv(index_env.PlainEnv):
     """Episodes of 2 to about 30 steps, over several shards of a chain; what it did before shows after a reset."""
 
-    n_made = 0
+    n_made = n_steps = 0
 
     def __init__(self, channels_last: bool = False) -> None:
         super().__init__(channels_last)
@@ -37,6 +39,7 @@ class LongEnv(index_env.PlainEnv):
 
     def step(self, action: Any) -> Any:
         observation, reward, _, truncated, info = super().step(action)
+        type(self).n_steps += 1
         return observation, reward, bool(self.np_random.random() < 0.1), truncated, info
 
     def _observe(self) -> Any:
@@ -58,7 +61,7 @@ gym.register("Long-v0", entry_point=LongEnv, max_episode_steps=STEPS * SHARDS)
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect_module, "CHAINED_SHARD_TRANSITIONS", PER_SHARD)
+    monkeypatch.setattr(chains, "CHAINED_SHARD_TRANSITIONS", PER_SHARD)
 
 
 def collect_long(folder: Path, n: int = 150, **kwargs: Any) -> TransitionDataset:
@@ -99,6 +102,41 @@ def test_grown_repaired_and_direct_are_the_same_bytes(tmp_path: Path, n: int) ->
         assert tree(tmp_path / "d") == tree(tmp_path / "direct")
 
 
+@pytest.mark.parametrize(
+    ("missing", "n_shards"),
+    [
+        ([1, 3], 4),  # one pass through the chain for both, which ends after the last
+        ([0, 4], 5),
+        ([6, 8, 12], 4 + 3),  # chains of shards 5 to 9 and 10 to 12
+    ],
+)
+def test_missing_shards_of_a_chain_take_one_pass(
+    tmp_path: Path, missing: list[int], n_shards: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    n = 13 * PER_SHARD
+    collect_long(tmp_path / "d", n)
+    before = tree(tmp_path / "d")
+    for k in missing:
+        (tmp_path / "d" / f"shard-{k:05d}.json").unlink()
+    LongEnv.n_steps = 0
+    collect_long(tmp_path / "d", n, progress=True)
+    assert LongEnv.n_steps == n_shards * PER_SHARD
+    assert tree(tmp_path / "d") == before
+    again = [k - before - 1 for before, k in itertools.pairwise([missing[0] // SHARDS * SHARDS - 1, *missing])]
+    assert f"stepping through {again[0] * PER_SHARD} before them again" in capsys.readouterr().err or not again[0]
+
+
+def test_what_is_stepped_through_again_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    collect_long(tmp_path / "d", 4 * PER_SHARD)
+    before = tree(tmp_path / "d")
+    (tmp_path / "d" / "shard-00003.json").unlink()
+    kept = []
+    real = Rollout.advance
+    monkeypatch.setattr(Rollout, "advance", lambda self, *args: kept.append(args[1]) or real(self, *args))
+    collect_long(tmp_path / "d", 4 * PER_SHARD)
+    assert kept == [PER_SHARD] and tree(tmp_path / "d") == before
+
+
 @pytest.mark.parametrize("n_workers", [2, 7])
 def test_workers_give_the_same_bytes(tmp_path: Path, n_workers: int) -> None:
     collect_long(tmp_path / "one")
@@ -118,7 +156,7 @@ def test_stacks_are_those_of_vec_frame_stack(
     tmp_path: Path, channels_last: bool, n_stack: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Replay: the recorded actions of the first chain, from the same seeds, through SB3's wrappers."""
-    monkeypatch.setattr(collect_module, "CHAINED_SHARD_TRANSITIONS", N_ENVS)  # shards of one step
+    monkeypatch.setattr(chains, "CHAINED_SHARD_TRANSITIONS", N_ENVS)  # shards of one step
     monkeypatch.setattr(index_env, "SHAPE", (3, 10, 11))
     kwargs = {"channels_last": channels_last}
     dataset = collect_long(tmp_path / "d", 60, env_kwargs=kwargs, frame_stack=n_stack)
@@ -213,7 +251,7 @@ def test_the_default_number_of_copies_is_that_of_the_folder(tmp_path: Path) -> N
     collect("Long-v0", 40, tmp_path / "d", seed=2)
     assert TransitionDataset(tmp_path / "d").meta["n_envs"] == N_ENVS
     collect("Long-v0", 40, tmp_path / "e", seed=2)
-    assert TransitionDataset(tmp_path / "e").meta["n_envs"] == collect_module.N_COPIES
+    assert TransitionDataset(tmp_path / "e").meta["n_envs"] == environments.N_COPIES
 
 
 def test_a_function_makes_the_environment(tmp_path: Path) -> None:

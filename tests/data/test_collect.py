@@ -16,11 +16,13 @@ from dataset_inputs import tree
 
 from sb3_abisim.common import vocabulary
 from sb3_abisim.common.files import folder_lock
-from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data import chains
 from sb3_abisim.data import writer as dataset_writer
-from sb3_abisim.data.collect import collect, collect_shard, main, make_vector_env
+from sb3_abisim.data.collect import collect, main
 from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.environments import make_vector_env
 from sb3_abisim.data.format import CONFIG_NAME, CUT, META_NAME, TERMINATED, TRUNCATED, DatasetError
+from sb3_abisim.data.rollout import collect_shard
 
 N_ENVS = 4
 # 12 steps of 4 copies: two time limits.
@@ -32,7 +34,7 @@ CHILD_ENV = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).pare
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect_module, "SHARD_TRANSITIONS", PER_SHARD)
+    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", PER_SHARD)
 
 
 def collect_index(folder: Path, n: int = 110, seed: int = 3, n_envs: int = N_ENVS, **kwargs: object) -> str:
@@ -310,7 +312,7 @@ def test_nav2d_data_are_what_single_environments_show(tmp_path: Path) -> None:
 
 
 def test_discrete_actions_are_uniform_over_the_whole_range(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect_module, "SHARD_TRANSITIONS", 3000)
+    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", 3000)
     collect_index(tmp_path / "d", 3000)
     dataset = TransitionDataset(tmp_path / "d")
     counts = np.bincount(dataset.actions(dataset.valid_starts()), minlength=5)
@@ -362,7 +364,7 @@ def test_mistakes_exit_2_with_one_line(
 
 def test_shards_too_large_for_memory_become_chains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # An episode of 6 frames of 60 bytes takes 360 bytes.
-    monkeypatch.setattr(collect_module, "MAX_SHARD_BYTES", 3 * 360 + 300)
+    monkeypatch.setattr(chains, "MAX_SHARD_BYTES", 3 * 360 + 300)
     for n_envs, version in ((3, 1), (8, 3)):
         collect_index(tmp_path / str(n_envs), n_envs=n_envs)
         meta = TransitionDataset(tmp_path / str(n_envs)).meta

@@ -7,14 +7,14 @@ import index_env
 import numpy as np
 import pytest
 
-from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data import chains
 from sb3_abisim.data.collect import collect, main
 from sb3_abisim.data.dataset import TransitionDataset
 
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect_module, "SHARD_TRANSITIONS", 48)
+    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", 48)
 
 
 def test_an_environment_made_without_a_limit(tmp_path: Path) -> None:

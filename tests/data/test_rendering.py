@@ -10,10 +10,12 @@ from dataset_inputs import rewrite_meta, tree
 from scan_inputs import empty_room
 
 from sb3_abisim.common import files as atomic
-from sb3_abisim.data import collect as collect_module
-from sb3_abisim.data.collect import collect, collect_shard, make_vector_env
+from sb3_abisim.data import chains
+from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.environments import make_vector_env
 from sb3_abisim.data.format import META_NAME, DatasetError
+from sb3_abisim.data.rollout import collect_shard
 from sb3_abisim.envs.scan_nav.env import ScanNavEnv, ScanNavVectorEnv
 
 N = 500
@@ -22,7 +24,7 @@ SMALL = {"stop": "auto", "image_size": 32, "goals_per_scene": 3, "max_episode_st
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect_module, "SHARD_TRANSITIONS", 160)
+    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", 160)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("data") / "scan"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collect_module, "SHARD_TRANSITIONS", 160)
+        patch.setattr(chains, "SHARD_TRANSITIONS", 160)
         collect("ScanNav-v0", N, path, n_envs=4, seed=3, env_kwargs={**SMALL, "scenes": str(scene)})
     return path
 
@@ -87,7 +89,7 @@ def test_shards_of_many_copies_fit_into_memory(tmp_path: Path) -> None:
     """64 copies of 500 steps would be 2 GiB of frames."""
     env = make_vector_env("ScanNav-v0", 64, {"scenes": 0, "goals_per_scene": 1})
     env.reset(seed=0)
-    assert collect_module._steps_of_whole_limits(env, "ScanNav-v0", 500) == 500
+    assert chains._steps_of_whole_limits(env, "ScanNav-v0", 500) == 500
 
 
 def test_stopped_anywhere_the_same_command_ends_with_the_same_bytes(

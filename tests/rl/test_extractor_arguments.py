@@ -14,14 +14,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import sb3_abisim
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.registry import methods
-from sb3_abisim.rl.extractors import (
-    ActionBisimExtractor,
-    PretrainedExtractor,
-    VanillaExtractor,
-    extractor_class,
-    method_of,
-    network_arguments,
-)
+from sb3_abisim.rl.extractor_classes import extractor_class, method_of
+from sb3_abisim.rl.extractors import ActionBisimExtractor, PretrainedExtractor, VanillaExtractor
+from sb3_abisim.rl.file_network import network_arguments
 
 pytestmark = pytest.mark.usefixtures("batch_norm_is_known")
 

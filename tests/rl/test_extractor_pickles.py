@@ -17,7 +17,7 @@ from sb3_abisim import registry
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.objectives.ssi import InverseDynamics
 from sb3_abisim.registry import methods
-from sb3_abisim.rl.extractors import extractor_class, method_of
+from sb3_abisim.rl.extractor_classes import extractor_class, method_of
 
 ROOT = Path(__file__).resolve().parents[2]
 # A package that adds a method, as users write them.

@@ -21,7 +21,8 @@ from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.checks import check_trained_with
-from sb3_abisim.rl.extractors import VanillaExtractor, extractor_class
+from sb3_abisim.rl.extractor_classes import extractor_class
+from sb3_abisim.rl.extractors import VanillaExtractor
 from sb3_abisim.zoo.manager import MethodExperimentManager, install, with_eval_split
 from sb3_abisim.zoo.methods import ENCODING_WRAPPER, MethodRecord, encoding_kwargs, read_entries
 from sb3_abisim.zoo.runs import read_run

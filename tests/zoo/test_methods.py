@@ -9,7 +9,7 @@ import torch as th
 from torch import nn
 from zoo_inputs import write_encoder
 
-from sb3_abisim.rl.extractors import extractor_class
+from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.optimizers import EncoderLRAdam
 from sb3_abisim.zoo.methods import (
     ENCODER_CALLBACK,

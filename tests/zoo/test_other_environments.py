@@ -16,7 +16,7 @@ from zoo_inputs import SMALL, run, write_encoder
 
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.checks import find_extractors
-from sb3_abisim.rl.extractors import extractor_class
+from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
 from sb3_abisim.zoo.evaluate import evaluate_final
 from sb3_abisim.zoo.methods import encoding_kwargs

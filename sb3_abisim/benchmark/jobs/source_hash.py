@@ -15,8 +15,9 @@ import sb3_abisim
 PACKAGE = Path(sb3_abisim.__file__).parent
 # What datasets come from; encoders and runs come from the whole package but what only looks at results.
 _COLLECTION = (
-    "common/grids.py", "common/spaces.py", "data/collect.py", "data/copies.py", "data/format.py", "data/writer.py",
-    "envs/", "media/",
+    "common/grids.py", "common/spaces.py", "data/chains.py", "data/collect.py", "data/copies.py",
+    "data/environments.py", "data/format.py", "data/rollout.py", "data/vectorized.py",
+    "data/writer.py", "envs/", "media/",
 )  # fmt: skip
 _EVALUATION = ("zoo/evaluate.py", "zoo/runs.py")
 _READERS = ("analysis/", "benchmark/", "demo.py", "zoo/record.py", *_EVALUATION)
