@@ -28,7 +28,7 @@ def file_of(layers, shape, objective="ssi", seed=0):
     # What an untrained encoder of the same network is made of.
     network = next(name for name, network in networks().items() if network.observation_shape == shape)
     encoder = Encoder(layers, n_features, network, {}, shape)
-    metadata = {"objective": objective, "settings": {"seed": seed}, "env_id": "?"}
+    metadata = {"objective": objective, "settings": {"seed": seed}, "env_id": "?", "preprocessing": {}}
     return EncoderFile(Path("nowhere"), "0" * 64, encoder, metadata)
 
 

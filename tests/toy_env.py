@@ -43,6 +43,29 @@ class ToyEnv(gym.Env[NDArray[np.uint8], np.int64]):
         return self.np_random.integers(0, 256, SHAPE, np.uint8)
 
 
+class Invert(gym.ObservationWrapper[NDArray[np.uint8], np.int64, NDArray[np.uint8]]):
+    """The negative."""
+
+    def observation(self, observation: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return 255 - observation
+
+
+class Lives(gym.Wrapper[Any, Any, Any, Any]):
+    """Ends an episode every two steps, and lets the environment go on, as wrappers of Atari do where a life is lost."""
+
+    over = True
+
+    def reset(self, **kwargs: Any) -> Any:
+        if self.over:
+            self.shown = self.env.reset(**kwargs)
+        return self.shown
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.over, self.shown = terminated or truncated, (observation, info)
+        return observation, reward, terminated or self.unwrapped._step % 2 == 0, truncated, info
+
+
 gym.register("Toy-v0", entry_point=ToyEnv)
 # The same with what sb3_abisim knows of an environment.
 gym.register("SplitToy-v0", entry_point=ToyEnv)

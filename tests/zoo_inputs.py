@@ -20,7 +20,13 @@ SMALL = {
 }
 
 
-def write_encoder(path: Path, env_id: str, objective: str = "abisim", **network_kwargs: Any) -> str:
+def write_encoder(
+    path: Path,
+    env_id: str,
+    objective: str = "abisim",
+    preprocessing: dict[str, Any] | None = None,
+    **network_kwargs: Any,
+) -> str:
     env = gym.make(env_id)
     th.manual_seed(len(path.name))
     return save_encoder(
@@ -34,6 +40,7 @@ def write_encoder(path: Path, env_id: str, objective: str = "abisim", **network_
         settings={},
         dataset_hash="0" * 64,
         reference_observations=np.stack([env.reset(seed=seed)[0] for seed in range(2)]),
+        preprocessing=preprocessing,
     )
 
 

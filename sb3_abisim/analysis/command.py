@@ -20,6 +20,7 @@ from sb3_abisim.analysis.nav2d_exact import BINS, EVAL_SEED, STEPS, ExactReferen
 from sb3_abisim.analysis.sweep import PAPER_C
 from sb3_abisim.common.cli import make_parser, run
 from sb3_abisim.common.files import write_atomic
+from sb3_abisim.pretraining.pretrain import read_env_id
 
 SWEEP_LAYOUTS = 2
 # The committed encoders, where the command runs in a checkout.
@@ -109,6 +110,9 @@ def _figure_parser(name: str) -> argparse.ArgumentParser:
     if figure.encoders:
         parser.add_argument("encoders", nargs="*", metavar="ENCODER", help=ENCODERS_HELP[figure.trained])
     parser.add_argument("--env", default=figure.env_ids[0], metavar="ID", help="environment (default: %(default)s)")
+    if figure.of_data is not None:
+        help = "look at this dataset of sb3-abisim collect instead of new episodes"
+        parser.add_argument("--data", type=Path, metavar="DIR", help=help)
     parser.add_argument("-n", type=int, default=figure.size, help=f"{figure.unit} (default: %(default)s)")
     parser.set_defaults(name=name)
     _add_folders(parser)
@@ -121,8 +125,10 @@ def _figure(args: argparse.Namespace) -> None:
     files = {}
     if one.encoders:
         names = args.encoders or default_encoders(args.env, trained if one.trained else None)
-        files = load_all(names, args.env)
-    path = make_figure(args.name, files, args.env, args.n, args.images, _numbers(args))
+        files = load_all(names, args.env, one.as_pretrained)
+    data = args.data if one.of_data is not None else None
+    env_id = args.env if data is None else read_env_id(data)
+    path = make_figure(args.name, files, env_id, args.n, args.images, _numbers(args), data)
     if args.name == "probes":
         print(probes.table(json.loads((_numbers(args) / f"{path.stem}.json").read_text())))
     print(path)

@@ -8,10 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from gymnasium.spaces import Box
+
 from sb3_abisim.analysis import curves, leak, neighbors, perturbation, pixels, plots, plots_pixels, probes, sweep
+from sb3_abisim.analysis.scenes import eval_settings, preprocessing_of
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.data.environments import make_vector_env
+from sb3_abisim.data.environments import Preprocessing, make_vector_env
 from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
 from sb3_abisim.registry import get_traits
 
@@ -31,6 +35,9 @@ class Figure:
     :param plot: from the numbers to the PNG
     :param trained: whether encoders of a custom folder join the shipped ones by default
     :param encoders: whether it looks at encoders at all
+    :param as_pretrained: whether encoders are shown what they have recorded: wrappers, stacks, the image of a Dict
+    :param of_data: from a dataset's folder and size to the numbers, in place of new episodes; None where there is no
+        such way
     """
 
     help: str
@@ -41,6 +48,8 @@ class Figure:
     plot: Plot
     trained: bool = False
     encoders: bool = True
+    as_pretrained: bool = False
+    of_data: Callable[[Path, int], dict[str, Any]] | None = None
 
 
 FIGURES = {
@@ -63,21 +72,22 @@ FIGURES = {
     ),
     "neighbors": Figure(
         "nearest neighbors in embedding space", ("DistractorPointMaze-v0",), 500, "episodes", neighbors.neighbors,
-        plots_pixels.plot_neighbors,
+        plots_pixels.plot_neighbors, as_pretrained=True,
     ),
     "probes": Figure(
         "what probes read from embeddings, and the distractor-invariance ratio",
         ("DistractorPointMaze-v0", "PointMaze-v0", "Nav2D-v0"), 300, "episodes to learn from", probes.probes,
-        plots_pixels.plot_probes, trained=True,
+        plots_pixels.plot_probes, trained=True, as_pretrained=True,
     ),
     "curves": Figure(
         "pretraining curves, from the model cards",
         ("DistractorPointMaze-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "Nav2D-v0"), 1, "unused",
-        lambda files, env_id, size: curves.curves(files), plots_pixels.plot_curves,
+        lambda files, env_id, size: curves.curves(files), plots_pixels.plot_curves, as_pretrained=True,
     ),
     "leak": Figure(
         "can the action be read from a few pixels?", ("DistractorPointMaze-v0", "Nav2D-v0"), 300, "episodes",
         lambda files, env_id, size: leak.leak_maps(env_id, size), plots_pixels.plot_leak, encoders=False,
+        of_data=leak.leak_maps_of_data,
     ),
 }  # fmt: skip
 
@@ -100,22 +110,34 @@ def default_encoders(env_id: str, trained: Path | None = None) -> list[str]:
     return names
 
 
-def load_all(names: list[str], env_id: str) -> dict[str, EncoderFile]:
+def load_all(names: list[str], env_id: str, as_pretrained: bool = False) -> dict[str, EncoderFile]:
     """Encoders by name, checked against the environment's observations.
 
     :param names: files or names
     :param env_id: a registered id
+    :param as_pretrained: see :class:`Figure`
     :raises ValueError: for an unknown id, or encoders of other observations
     """
-    env = make_vector_env(env_id, 1, {})
     files = {name: load_encoder(name) for name in names}
-    for file in files.values():
-        file.check(env.single_observation_space)
+    preprocessing = preprocessing_of(files) if as_pretrained else Preprocessing()
+    env_kwargs = next(iter(eval_settings(env_id, files).values())) if as_pretrained else {}
+    env = make_vector_env(env_id, 1, env_kwargs, preprocessing)
+    n_channels, *size = env.single_observation_space.shape or ()
     env.close()
+    for file in files.values():
+        file.check(Box(0, 255, (preprocessing.frame_stack * n_channels, *size), np.uint8))
     return files
 
 
-def make_figure(name: str, files: dict[str, EncoderFile], env_id: str, size: int, images: Path, numbers: Path) -> Path:
+def make_figure(
+    name: str,
+    files: dict[str, EncoderFile],
+    env_id: str,
+    size: int,
+    images: Path,
+    numbers: Path,
+    data: Path | None = None,
+) -> Path:
     """Compute a figure; write its numbers, then the PNG.
 
     :param name: a key of :data:`FIGURES`
@@ -124,6 +146,7 @@ def make_figure(name: str, files: dict[str, EncoderFile], env_id: str, size: int
     :param size: see :class:`Figure`, at least 1
     :param images: folder for ``<name>-<env_id>.png``
     :param numbers: folder for ``<name>-<env_id>.json``
+    :param data: a dataset's folder to look at in place of new episodes, for figures that can
     :return: the PNG
     :raises ValueError: for a size below 1, and what the figure refuses
     """
@@ -131,9 +154,13 @@ def make_figure(name: str, files: dict[str, EncoderFile], env_id: str, size: int
         raise ValueError(f"-n must be at least 1, got {size}")
     # Now, not after minutes of computing.
     plots.pyplot()
-    results = FIGURES[name].compute(files, env_id, size)
-    settings = {"figure": name, "env_id": env_id, "size": size, "size_counts": FIGURES[name].unit}
-    return write_figure(settings | results, FIGURES[name].plot, images, numbers)
+    figure = FIGURES[name]
+    if data is not None and figure.of_data is not None:
+        results = figure.of_data(data, size)
+    else:
+        results = figure.compute(files, env_id, size)
+    settings = {"figure": name, "env_id": env_id, "size": size, "size_counts": figure.unit}
+    return write_figure(settings | results, figure.plot, images, numbers)
 
 
 def make_sweep(

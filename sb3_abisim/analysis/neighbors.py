@@ -13,7 +13,14 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import embed
-from sb3_abisim.analysis.scenes import Samples, agent_positions, eval_settings, local_obstacles, sample_episodes
+from sb3_abisim.analysis.scenes import (
+    Samples,
+    agent_positions,
+    eval_settings,
+    local_obstacles,
+    preprocessing_of,
+    sample_episodes,
+)
 from sb3_abisim.networks.encoder_file import EncoderFile
 
 PER_EPISODE = 10
@@ -32,9 +39,9 @@ def neighbors(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed:
         where the environment does not say, and ``examples`` of a few queries; ``observations``, not for JSON: by
         setting, the queries' and each encoder's neighbors'
     """
-    settings, observations = {}, {}
-    for setting, env_kwargs in eval_settings(env_id).items():
-        samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, env_kwargs)
+    settings, observations, preprocessing = {}, {}, preprocessing_of(files)
+    for setting, env_kwargs in eval_settings(env_id, files).items():
+        samples = sample_episodes(env_id, n_episodes, PER_EPISODE, seed, env_kwargs, preprocessing)
         settings[setting], observations[setting] = _setting(files, samples, seed)
     hashes = {name: file.hash for name, file in files.items()}
     return {"per_episode": PER_EPISODE, "hashes": hashes, "settings": settings, "observations": observations}
@@ -46,20 +53,22 @@ def _setting(
     generator = np.random.default_rng(seed)
     queries = generator.choice(len(samples), N_SHOWN, replace=False)
     numbers: dict[str, Any] = {}
-    observations = {"query": samples.obs[queries]}
+    # Of stacks the newest frame.
+    n_channels = samples.env.single_observation_space.shape[0]
+    observations = {"query": samples.obs[queries, -n_channels:]}
     for name, file in files.items():
         nearest, distances = nearest_elsewhere(embed(file.encoder.eval(), samples.obs), samples.episodes)
         examples = _pair_numbers(samples, queries, nearest[queries])
         examples["distance"] = _relative(distances)[queries].tolist()
         numbers[name] = {**similarity(samples, nearest), "examples": examples}
-        observations[name] = samples.obs[nearest[queries]]
+        observations[name] = samples.obs[nearest[queries], -n_channels:]
     numbers["random pairs"] = similarity(samples, _random_elsewhere(samples.episodes, generator))
     return numbers, observations
 
 
 def _relative(distances: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Distances in units of their mean over all queries."""
-    relative: NDArray[np.float64] = distances.astype(np.float64) / distances.mean()
+    """Distances in units of their mean over all queries; zeros where every state is met again exactly."""
+    relative: NDArray[np.float64] = distances.astype(np.float64) / (distances.mean() or 1.0)
     return relative
 
 

@@ -25,6 +25,7 @@ from sb3_abisim.analysis.scenes import (
     agent_positions,
     eval_settings,
     local_obstacles,
+    preprocessing_of,
     render_point_mazes,
     sample_episodes,
 )
@@ -78,7 +79,10 @@ def targets(samples: Samples) -> dict[str, Target]:
     """
     factors, agents, obstacles = samples.factors, agent_positions(samples), local_obstacles(samples)
     if not factors:
-        raise ValueError("probes read an environment's factors(), and this one has none; add them to its batch class")
+        raise ValueError(
+            "probes read an environment's factors(), and this one has none; add them to its batch class, or show "
+            "numbers beside the image in a Dict of observations"
+        )
     if agents is None or obstacles is None:
         return {name: _plain_target(values) for name, values in factors.items()}
     found = {"agent": Target(agents, "continuous"), "obstacles": Target(obstacles.astype(np.float64), "binary")}
@@ -156,9 +160,12 @@ def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: in
     """
     # Before minutes of computing.
     _refuse_twins([_origin(file) for file in files.values()])
-    settings = eval_settings(env_id)
+    settings, shown = eval_settings(env_id, files), preprocessing_of(files)
     learn, test = (
-        {name: sample_episodes(env_id, n_episodes, PER_EPISODE, 2 * seed + k, kw) for name, kw in settings.items()}
+        {
+            name: sample_episodes(env_id, n_episodes, PER_EPISODE, 2 * seed + k, kwargs, shown)
+            for name, kwargs in settings.items()
+        }
         for k in (1, 2)
     )
     observations = next(iter(learn.values())).obs

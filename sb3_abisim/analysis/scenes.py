@@ -1,6 +1,7 @@
 """States of new episodes, what surrounds the agent in them, and observations of states that no episode has been in."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import EVAL_SEED
-from sb3_abisim.data.environments import make_vector_env
+from sb3_abisim.data.environments import Preprocessing, make_vector_env
 from sb3_abisim.data.format import check_spaces
 from sb3_abisim.data.rollout import collect_shard
 from sb3_abisim.envs.backgrounds.player import composite
@@ -27,10 +28,12 @@ from sb3_abisim.envs.point_maze.layout import (
 )
 from sb3_abisim.envs.scan_nav.env import ScanNavVectorEnv
 from sb3_abisim.envs.scan_nav.map import ScanMap
+from sb3_abisim.networks.encoder_file import EncoderFile
 from sb3_abisim.registry import get_traits
+from sb3_abisim.zoo.preprocessing import recorded_preprocessing
 
 # Copies collected at once; the 64 x 64 observations of a whole episode take 1.6 MB.
-N_COPIES = 50
+N_COPIES, N_SINGLE_COPIES = 50, 8
 # Of an episode in an environment without a time limit, and of all observations that are held at once.
 MAX_STEPS = 1000
 MAX_BYTES = 2**30
@@ -44,7 +47,7 @@ class Samples:
     """Transitions of random play with the simulator's state at their beginning.
 
     :param env: the environment that they are from
-    :param obs: s_t, uint8 (n, channels, height, width)
+    :param obs: s_t, uint8 (n, channels, height, width), stacked where encoders see stacks
     :param actions: a_t, (n,) or (n, action_dim)
     :param next_obs: s_{t+1}, as ``obs``
     :param factors: name to (n, ...); empty where the environment has none
@@ -62,10 +65,36 @@ class Samples:
         return len(self.obs)
 
 
-def eval_settings(env_id: str) -> dict[str, dict[str, Any]]:
+def preprocessing_of(files: Mapping[str, EncoderFile]) -> Preprocessing:
+    """What stood between the environment and encoders in pretraining.
+
+    :param files: encoders by name
+    :raises ValueError: if it is not the same for all, naming both sides
+    """
+    if not files:
+        return Preprocessing()
+    first, *others = files.items()
+    for other in others:
+        sides = [_recorded(file) for _, file in (first, other)]
+        if sides[0] != sides[1]:
+            raise ValueError(
+                f"encoders were pretrained on different observations ({first[0]}: {sides[0]}, {other[0]}: {sides[1]}); "
+                "look at one after the other"
+            )
+    return recorded_preprocessing(_recorded(first[1]), str(first[1].path))
+
+
+def _recorded(file: EncoderFile) -> dict[str, Any]:
+    # Where the channels were follows from the environment.
+    return {key: value for key, value in file.metadata["preprocessing"].items() if value and key != "channels"}
+
+
+def eval_settings(env_id: str, files: Mapping[str, EncoderFile] | None = None) -> dict[str, dict[str, Any]]:
     """What encoders are looked at on: name to the environment's keyword arguments. The first is that of pretraining.
 
     :param env_id: a registered id
+    :param files: encoders by name; of an environment without splits, the arguments that they were pretrained with hold
+    :raises ValueError: if these are not the same for all, naming both sides
     """
     traits, found = get_traits(env_id), batch_class(env_id)
     if {"train", "eval"} <= set(traits.splits):
@@ -76,11 +105,24 @@ def eval_settings(env_id: str) -> dict[str, dict[str, Any]]:
         return {f"train {what}": {**kwargs, "split": "train", **plain}, f"eval {what}": {**kwargs, "split": "eval"}}
     # Elsewhere a new episode need not be a new layout: there are five apartments.
     new_layouts = found is not None and issubclass(found, Nav2DVectorEnv | PointMazeVectorEnv)
-    return {"eval layouts" if new_layouts else "eval episodes": dict(traits.collect_kwargs)}
+    of_files = [(name, file.metadata) for name, file in (files or {}).items() if file.metadata["env_id"] == env_id]
+    for name, metadata in of_files:
+        if metadata["env_kwargs"] != of_files[0][1]["env_kwargs"]:
+            raise ValueError(
+                f"encoders were pretrained in {env_id} with different arguments ({of_files[0][0]}: "
+                f"{of_files[0][1]['env_kwargs']}, {name}: {metadata['env_kwargs']}); look at one after the other"
+            )
+    kwargs = dict(of_files[0][1]["env_kwargs"] if of_files else traits.collect_kwargs)
+    return {"eval layouts" if new_layouts else "eval episodes": kwargs}
 
 
 def sample_episodes(
-    env_id: str, n_episodes: int, per_episode: int, seed: int = 0, env_kwargs: dict[str, Any] | None = None
+    env_id: str,
+    n_episodes: int,
+    per_episode: int,
+    seed: int = 0,
+    env_kwargs: dict[str, Any] | None = None,
+    preprocessing: Preprocessing | None = None,
 ) -> Samples:
     """Play new episodes at random and keep a few transitions of each.
 
@@ -89,11 +131,15 @@ def sample_episodes(
     :param per_episode: transitions sampled from each; shorter episodes give all they have
     :param seed: other seeds give other episodes; none are those of a dataset
     :param env_kwargs: passed to the environment
+    :param preprocessing: what stands between the environment and its observations; None for nothing
     :raises ValueError: for ``n_episodes`` below 1, an unknown environment, or one without image observations
     """
     if n_episodes < 1:
         raise ValueError(f"the number of episodes must be at least 1, got {n_episodes}")
-    env = make_vector_env(env_id, min(N_COPIES, n_episodes), env_kwargs or {})
+    # Copies that do not run as one batch may be whole simulators.
+    most = N_COPIES if batch_class(env_id) is not None else N_SINGLE_COPIES
+    env = make_vector_env(env_id, min(most, n_episodes), env_kwargs or {}, preprocessing)
+    n_stack = 1 if preprocessing is None else preprocessing.frame_stack
     check_spaces(env.single_observation_space, env.single_action_space)
     batch = env.unwrapped
     # Segments of such environments come without observations.
@@ -115,7 +161,7 @@ def sample_episodes(
                 state = {name: array[t] for name, array in segment.factors.items()}
                 if render is None:
                     assert segment.frames is not None
-                    obs, next_obs = segment.frames[t], segment.frames[t + 1]
+                    obs, next_obs = (_stack(segment.frames, i, n_stack) for i in (t, t + 1))
                 else:
                     obs, next_obs = render({name: array[t : t + 2] for name, array in segment.factors.items()})
                 rows.append((obs, segment.actions[t], next_obs, state, n))
@@ -126,6 +172,12 @@ def sample_episodes(
     return Samples(
         batch, np.array(observations), np.array(actions), np.array(next_observations), factors, np.array(episodes)
     )
+
+
+def _stack(frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], t: int, n: int) -> NDArray[np.uint8]:
+    """The n frames of an episode up to t, as ``VecFrameStack`` shows them."""
+    shown = [frames[i] if i >= 0 else np.zeros_like(frames[0]) for i in range(t - n + 1, t + 1)]
+    return np.concatenate(shown)
 
 
 def agent_positions(samples: Samples) -> NDArray[np.float64] | None:

@@ -3,7 +3,7 @@
 import dataclasses
 import inspect
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,14 @@ from sb3_abisim.common.cli import parse_pairs
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.config import FOLLOWING, load_config
 from sb3_abisim.registry import get_method, get_objective, get_traits, methods
-from sb3_abisim.zoo.evaluate import not_rebuilt
+from sb3_abisim.zoo.collect import preprocessing_entry
 from sb3_abisim.zoo.methods import MethodSpec, hyperparameters_entry
+from sb3_abisim.zoo.preprocessing import check_preprocessing, items, normalizes_observations, other_vec_wrappers
 
-# What rl-zoo3 reads besides the algorithm's arguments, and what another flag sets. Without env_wrapper and
-# frame_stack: pretraining and the final evaluation make environments that have neither.
+# What rl-zoo3 reads besides the algorithm's arguments, and what another flag sets.
 ZOO_PARAMS = {
-    "callback", "env_kwargs", "monitor_kwargs", "n_envs", "noise_std", "noise_type", "normalize", "vec_env_wrapper",
+    "callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "noise_std", "noise_type",
+    "normalize", "vec_env_wrapper",
 }  # fmt: skip
 FLAGS = {"device": "--device", "n_timesteps": "--n-timesteps", "seed": "--seeds"}
 # "Steps per eval", given for Pointmass alone.
@@ -70,36 +71,49 @@ def _check_owners(plan: Plan, jobs: list[Job]) -> None:
             head, dot, _ = word.partition(".")
             if dot and head in owners and head not in used:
                 raise ValueError(f"{option} {word} is for {head}, but here is only {', '.join(sorted(used)) or 'none'}")
-    for word in plan.params:
-        if re.match(r"(\w+\.)?env_kwargs:", word) and any(job.kind == "data" for job in jobs):
-            raise ValueError(
-                f"--params {word} would hold for RL, but not for the data that encoders are pretrained on; collect and "
-                "pretrain with the same arguments yourself, and give the files: METHOD=FILE"
-            )
 
 
-def data_job(plan: Plan, env_id: str) -> Job:
-    """The dataset of an environment."""
+def data_job(plan: Plan, env_id: str, hyperparams: Mapping[str, Any]) -> Job:
+    """The dataset of an environment, which is shown as the runs see it.
+
+    :param hyperparams: of the runs
+    """
     traits = get_traits(env_id)
-    n, env_kwargs = plan.n_transitions or traits.n_transitions, dict(traits.collect_kwargs)
+    n = plan.n_transitions or traits.n_transitions
+    env_kwargs = {**(hyperparams.get("env_kwargs") or {}), **traits.collect_kwargs}
+    chosen = sorted(set(hyperparams.get("env_kwargs") or {}) & set(traits.split_kwargs))
+    if chosen:
+        raise ValueError(
+            f"env_kwargs {', '.join(chosen)} would choose what data for pretraining is collected in, too; collect and "
+            "pretrain as you mean it, and give the files: METHOD=FILE"
+        )
+    wrappers, n_stack = items(hyperparams.get("env_wrapper")), hyperparams.get("frame_stack") or 1
     settings: dict[str, Any] = {"env_id": env_id, "n_transitions": n, "seed": 0, "env_kwargs": env_kwargs}
+    # Left out where there is nothing, as in benchmarks of before.
+    settings |= ({"env_wrapper": wrappers} if wrappers else {}) | ({"frame_stack": n_stack} if n_stack > 1 else {})
     output = f"data/{_folder(env_id)}-{job_key('data', settings)[:8]}"
     command = ["sb3_abisim", "collect", "--env", env_id, "-n", str(n), "-o", output]
     command += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in env_kwargs.items())] if env_kwargs else []
+    by_default = preprocessing_entry(env_id)
+    if wrappers or by_default.get("env_wrapper"):
+        command += ["--env-wrapper", *(map(str, wrappers) if wrappers else ["none"])]
+    if n_stack > 1 or by_default.get("frame_stack"):
+        command += ["--frame-stack", str(n_stack)]
     command += _packages(plan)
     return Job("data", f"collect {env_id}", settings, (), tuple(command), output, "meta.json", n)
 
 
-def encoder_job(plan: Plan, env_id: str, objective: str, seed: int) -> Job:
+def encoder_job(plan: Plan, env_id: str, objective: str, seed: int, hyperparams: Mapping[str, Any]) -> Job:
     """An encoder; one that builds on another method's starts from that one's with the same seed.
 
     :param objective: name of a method that has one
+    :param hyperparams: of the runs
     """
     objective_class = get_objective(objective)
     base = get_method(objective).base
-    inputs: tuple[Job, ...] = (data_job(plan, env_id),)
+    inputs: tuple[Job, ...] = (data_job(plan, env_id, hyperparams),)
     if base is not None:
-        inputs += (encoder_job(plan, env_id, base, seed),)
+        inputs += (encoder_job(plan, env_id, base, seed, hyperparams),)
     words = _params_of(plan.pretrain_params, objective, tuple(methods()))
     config = load_config(objective, env_id, parse_pairs(words, "--pretrain-params"))
     settable = inspect.signature(objective_class).parameters.keys() - FOLLOWING
@@ -131,17 +145,22 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     entry = hyperparameters_entry(algo, env_id)
     given = {name: value for name, _, value in (word.partition(":") for word in words)}
     _check_params(algo, given)
+    used = {**entry, **parse_pairs(words, "--params")}
+    if not isinstance(used.get("env_kwargs") or {}, Mapping):
+        raise ValueError(f"env_kwargs must be a mapping such as {{max_episode_steps: 20}}, got {used['env_kwargs']!r}")
     inputs: tuple[Job, ...] = ()
     if method.encoder is None and get_method(method.name).has_encoder_file:
-        inputs = (encoder_job(plan, env_id, method.name, encoder_seed),)
-    dataclasses.replace(method, encoder=inputs[0].output if inputs else method.encoder).hyperparameters(entry, given)
-    _check_wrappers(plan, env_id, {**entry, **parse_pairs(words, "--params")}, bool(inputs))
+        inputs = (encoder_job(plan, env_id, method.name, encoder_seed, used),)
+    spec = dataclasses.replace(method, encoder=inputs[0].output if inputs else method.encoder)
+    replaced = spec.hyperparameters(entry, parse_pairs(words, "--params"))
+    _check_wrappers(env_id, used, bool(inputs))
     n = plan.n_timesteps or int(entry["n_timesteps"])
     eval_freq = plan.eval_freq or min(PAPER_EVAL_FREQ, max(n // 100, 1))
     settings = {"env_id": env_id, "algo": algo, "seed": seed, "method": method.name, "frozen": method.frozen}
     conf_file, label = method.name, method.name
     if method.encoder is not None:
         file = load_encoder(method.encoder)
+        check_preprocessing(file, {**used, **replaced}, method.frozen)
         settings["encoder_hash"] = file.hash
         label += f"-{file.hash[:6]}"
         path = Path(method.encoder)
@@ -181,19 +200,18 @@ def _check_params(algo: str, names: Collection[str]) -> None:
             raise ValueError(f"{algo} has no hyperparameter {name!r}, only {', '.join(sorted(known))}")
 
 
-def _check_wrappers(plan: Plan, env_id: str, hyperparams: dict[str, Any], pretrains: bool) -> None:
-    """Refuse wrappers that stand between the environment and the agent, but not before pretraining or evaluation."""
-    wrappers = not_rebuilt(hyperparams)
-    changing = [name for name in wrappers if name in ("env_wrapper", "frame_stack")]
-    if changing and pretrains:
+def _check_wrappers(env_id: str, hyperparams: Mapping[str, Any], pretrains: bool) -> None:
+    """Refuse what stands between the environment and the agent, but cannot stand before an encoder or pretraining."""
+    if normalizes_observations(hyperparams.get("normalize")):
         raise ValueError(
-            f"the hyperparameters for {env_id} have {' and '.join(changing)}, and data for pretraining is collected "
-            "without; register the wrapped environment under another id"
+            f"the hyperparameters for {env_id} normalize observations ({hyperparams['normalize']!r}), which would no "
+            "longer be images; give --params \"normalize:{'norm_obs': False, 'norm_reward': True}\""
         )
-    if wrappers and plan.final_episodes:
+    others = other_vec_wrappers(hyperparams)
+    if others and pretrains:
         raise ValueError(
-            f"the final evaluation is made without {', '.join(wrappers)}; leave it out of --params, or give "
-            "--final-episodes 0"
+            f"the hyperparameters for {env_id} have the vec_env_wrapper {', '.join(others)}, and data for pretraining "
+            "is collected without; give what it does as env_wrapper, or encoder files: METHOD=FILE"
         )
 
 

@@ -212,7 +212,8 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, pol
     )  # fmt: skip
     parser.add_argument(
         "--env-wrapper", nargs="+", action="extend", default=[], metavar="CLASS",
-        help="dotted paths of wrappers, such as gymnasium.wrappers.GrayscaleObservation (default: the zoo's for ID)",
+        help="dotted paths of wrappers, such as gymnasium.wrappers.GrayscaleObservation, or none (default: the zoo's "
+        "for ID)",
     )  # fmt: skip
     parser.add_argument(
         "--frame-stack", type=int, metavar="N", help="observations shown together (default: the zoo's for ID, else 1)"
@@ -242,7 +243,7 @@ def _command(args: argparse.Namespace) -> None:
     known = args.entry_fn is not None and args.env in gym.registry
     entry = args.entry_fn(args.env, args.conf_file) if known else {}
     env_kwargs = {**(entry.get("env_kwargs") or {}), **parse_pairs(args.env_kwargs, "--env-kwargs")}
-    policy = None
+    wrappers, policy = [parse_value(text) for text in args.env_wrapper], None
     if args.policy_fn is not None and args.policy != "random":
         policy = args.policy_fn(args.policy, args.epsilon)
     try:
@@ -253,7 +254,7 @@ def _command(args: argparse.Namespace) -> None:
             seed=args.seed,
             n_envs=args.n_envs,
             env_kwargs=env_kwargs,
-            env_wrapper=[parse_value(text) for text in args.env_wrapper] or entry.get("env_wrapper"),
+            env_wrapper=None if args.env_wrapper == ["none"] else wrappers or entry.get("env_wrapper"),
             frame_stack=entry.get("frame_stack", 1) if args.frame_stack is None else args.frame_stack,
             image_key=args.image_key,
             policy=policy,

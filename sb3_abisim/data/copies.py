@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from sb3_abisim.common.spaces import is_channels_first
 
 MakeFn = Callable[[], gym.Env[Any, Any]]
+_WRAPPERS = (
+    "a wrapper makes images: --env-wrapper gymnasium.wrappers.AddRenderObservation --env-kwargs render_mode:rgb_array "
+    "shows what the environment renders"
+)
 # Where the channels of an observation are: (C, H, W), (H, W, C) or (H, W).
 FIRST, LAST, NONE = "first", "last", "none"
-_WRAPPERS = (
-    "a wrapper makes others into such (gymnasium.wrappers.AddRenderObservation, TransformObservation), see "
-    "--env-wrapper"
-)
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,11 @@ class ImageLayout:
         if isinstance(space, spaces.Dict):
             images = [key for key, part in space.spaces.items() if _is_image(part)]
             if image_key is None and len(images) != 1:
+                if not images:
+                    raise ValueError(f"no observation of {space} is a uint8 image in 0..255; {remedy}")
                 raise ValueError(
-                    f"the observations have {len(images)} images ({', '.join(images) or 'none'}) in {space}; "
-                    + ("choose one with --image-key" if images else f"one must be uint8 in 0..255: {remedy}")
+                    f"the observations have {len(images)} images ({', '.join(images)}) in {space}; choose one with "
+                    "--image-key"
                 )
             image_key = images[0] if image_key is None else image_key
             if image_key not in images:

@@ -2,6 +2,7 @@
 
 import difflib
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -84,14 +85,30 @@ def make_vector_env(
             else:
                 make_fns[0] = functools.partial(_wrapped, lambda: made, wrapper)
         return EnvCopies(make_fns, image_key) if n_workers == 1 else WorkerCopies(make_fns, image_key, n_workers)
-    except ValueError as error:
-        if wrapper is None:
+    except Exception as error:
+        # Whatever an environment raises: a library that is not there, arguments that it does not take, no display.
+        if isinstance(error, ValueError) and wrapper is None:
             raise
-        raise ValueError(
-            f"{error} (with env_wrapper {preprocessing.env_wrapper}; --env-wrapper takes the place of the zoo's)"
-        ) from error
-    except (TypeError, OSError, gym.error.Error) as error:
-        raise ValueError(f"cannot make {env} with {env_kwargs}: {error}") from error
+        raise ValueError(_why_not_made(env, env_kwargs, preprocessing, error)) from error
+
+
+# What the errors of environments and wrappers say, and what helps.
+_HINTS = (
+    (r"requires render_mode", "add --env-kwargs render_mode:rgb_array"),
+    (r"(?i)opengl|glfw|egl|osmesa", "rendering without a display needs MUJOCO_GL=egl in front of the command"),
+    (r"to be a tuple, got .*list", "a YAML has lists only; rl_zoo3.wrappers.YAMLCompatResizeObservation takes one"),
+)
+
+
+def _why_not_made(env: Any, env_kwargs: dict[str, Any], preprocessing: Preprocessing, error: Exception) -> str:
+    text = f"{error}" or type(error).__name__
+    hints = [hint for pattern, hint in _HINTS if re.search(pattern, f"{type(error).__name__} {text}")]
+    if preprocessing.wrapper is not None:
+        hints = hints or ["--env-wrapper takes the place of the zoo's"]
+        text += f" (with env_wrapper {preprocessing.env_wrapper}; {'; '.join(hints)})"
+    elif hints:
+        text += f"; {'; '.join(hints)}"
+    return text if isinstance(error, ValueError) else f"cannot make {env} with {env_kwargs}: {text}"
 
 
 def as_made_or_reason(env_id: str, env_kwargs: dict[str, Any], preprocessing: Preprocessing) -> tuple[bool, str]:

@@ -9,6 +9,8 @@ import math
 import torch as th
 from torch import nn
 
+from sb3_abisim.networks.group_norm import GroupNorm
+
 FEATURES_DIM = 2048
 BASE_PLANES = 32
 N_GROUPS = 16
@@ -26,14 +28,14 @@ class BasicBlock(nn.Module):
         super().__init__()
         self.convs = nn.Sequential(
             nn.Conv2d(n_in, n_out, 3, stride, padding=1, bias=False),
-            nn.GroupNorm(N_GROUPS, n_out),
+            GroupNorm(N_GROUPS, n_out),
             nn.ReLU(),
             nn.Conv2d(n_out, n_out, 3, padding=1, bias=False),
-            nn.GroupNorm(N_GROUPS, n_out),
+            GroupNorm(N_GROUPS, n_out),
         )
         self.shortcut: nn.Module = nn.Identity()
         if stride != 1 or n_in != n_out:
-            self.shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), nn.GroupNorm(N_GROUPS, n_out))
+            self.shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), GroupNorm(N_GROUPS, n_out))
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """Add the convolved input to the input.
@@ -50,7 +52,7 @@ def resnet18_backbone(n_input_channels: int) -> nn.Sequential:
     """
     layers: list[nn.Module] = [
         nn.Conv2d(n_input_channels, BASE_PLANES, 7, stride=2, padding=3, bias=False),
-        nn.GroupNorm(N_GROUPS, BASE_PLANES),
+        GroupNorm(N_GROUPS, BASE_PLANES),
         nn.ReLU(),
         nn.MaxPool2d(3, stride=2, padding=1),
     ]
@@ -81,7 +83,7 @@ def compression(n_positions: int, features_dim: int = FEATURES_DIM) -> nn.Sequen
     n_compressed = max(1, round(features_dim / n_positions))
     return nn.Sequential(
         nn.Conv2d(BASE_PLANES * 8, n_compressed, 3, padding=1, bias=False),
-        nn.GroupNorm(1, n_compressed),
+        GroupNorm(1, n_compressed),
         nn.ReLU(),
         nn.Flatten(),
     )

@@ -7,6 +7,7 @@ import gymnasium as gym
 from torch import nn
 
 from sb3_abisim.networks.base import require_size
+from sb3_abisim.networks.group_norm import GroupNorm
 from sb3_abisim.registry import register_network
 
 MIN_SIZE = 3
@@ -26,7 +27,7 @@ def make_small(observation_space: gym.Space[Any], features_dim: int = 256) -> nn
     n_positions = math.prod(math.ceil(side / 4) for side in (height, width))
     return nn.Sequential(
         nn.Conv2d(n_channels, 16, 3, padding=1, bias=False),
-        nn.GroupNorm(1, 16, eps=1e-8),
+        GroupNorm(1, 16, eps=1e-8),
         nn.ReLU(),
         nn.Conv2d(16, 32, 3, stride=2, padding=1),
         nn.ReLU(),

@@ -67,6 +67,14 @@ class Actions(ABC):
         :return: float32 (number of actions, input_dim)
         """
 
+    @abstractmethod
+    def components(self, actions: th.Tensor) -> th.Tensor:
+        """What actions consist of, each of which may be read by itself.
+
+        :param actions: (batch, *shape of an action)
+        :return: (batch, number of components): int64, the number of a choice from 0; float32 in -1..1 for a ``Box``
+        """
+
     def enumerate(self, device: th.device) -> th.Tensor | None:
         """All actions as network inputs, in the order of :meth:`index`; None for a space that is not ``Discrete``.
 
@@ -126,6 +134,10 @@ class DiscreteActions(Actions):
         """All of them, whatever ``n`` is (the paper's expectation)."""
         return th.eye(self.n, device=device)
 
+    def components(self, actions: th.Tensor) -> th.Tensor:
+        """See :meth:`Actions.components`."""
+        return self.index(actions)[:, None]
+
     def enumerate(self, device: th.device) -> th.Tensor:
         """See :meth:`Actions.enumerate`."""
         return th.eye(self.n, device=device)
@@ -153,11 +165,11 @@ class MultiDiscreteActions(Actions):
 
     def inputs(self, actions: th.Tensor) -> th.Tensor:
         """See :meth:`Actions.inputs`."""
-        return self._one_hot(self._components(actions))
+        return self._one_hot(self.components(actions))
 
     def score(self, outputs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """See :meth:`Actions.score`."""
-        components = self._components(actions)
+        components = self.components(actions)
         log_prob, right = th.zeros(len(outputs), device=outputs.device), th.ones_like(components[:, 0]).bool()
         for logits, component in zip(th.split(outputs, self.sizes, dim=1), components.unbind(dim=1), strict=True):
             log_prob = log_prob - nn.functional.cross_entropy(logits, component, reduction="none")
@@ -172,8 +184,8 @@ class MultiDiscreteActions(Actions):
             components = th.stack([th.randint(size, (n,)) for size in self.sizes], dim=1)
         return self._one_hot(components).to(device)
 
-    def _components(self, actions: th.Tensor) -> th.Tensor:
-        """Counted from 0, int64 (..., number of components)."""
+    def components(self, actions: th.Tensor) -> th.Tensor:
+        """See :meth:`Actions.components`."""
         flat = actions.flatten(start_dim=actions.dim() - len(self.shape)).long()
         return flat - self.start.to(flat)
 
@@ -215,6 +227,10 @@ class MultiBinaryActions(Actions):
             return (numbers >> th.arange(self.input_dim) & 1).float().to(device)
         return th.randint(2, (n, self.input_dim)).float().to(device)
 
+    def components(self, actions: th.Tensor) -> th.Tensor:
+        """See :meth:`Actions.components`."""
+        return self.inputs(actions).long()
+
     def greatest(self, coefficients: th.Tensor) -> th.Tensor:
         """See :meth:`Actions.greatest`."""
         return coefficients.clamp_min(0.0).sum(dim=-1)
@@ -254,6 +270,10 @@ class BoxActions(Actions):
     def sample(self, n: int, device: th.device) -> th.Tensor:
         """See :meth:`Actions.sample`."""
         return -1.0 + 2.0 * th.rand(n, self.input_dim).to(device)
+
+    def components(self, actions: th.Tensor) -> th.Tensor:
+        """See :meth:`Actions.components`."""
+        return self.inputs(actions)
 
     def same(self, actions: th.Tensor, radius: float) -> th.Tensor:
         """See :meth:`Actions.same`."""

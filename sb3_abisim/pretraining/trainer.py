@@ -212,7 +212,8 @@ class PretrainRun:
             settings=self.settings,
             dataset_hash=dataset.hash,
             reference_observations=self._some_frames(N_REFERENCE),
-            preprocessing=dataset.preprocessing,
+            # That there was no wrapper is known of what was collected through wrappers, if there were any.
+            preprocessing={"env_wrapper": [], **dataset.preprocessing} if "preprocessing" in dataset.meta else None,
         )
         self.clean_up()
         warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval())

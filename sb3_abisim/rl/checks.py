@@ -1,12 +1,14 @@
 """Checks of loaded models: what a model holds, compared with what was asked for."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
-from sb3_abisim.rl.extractors import BaseEncoderExtractor, PretrainedExtractor
+from sb3_abisim.rl.combined import CombinedEncoderExtractor
+from sb3_abisim.rl.extractors import BaseEncoderExtractor, EncoderExtractor, PretrainedExtractor
 
 
 def find_extractors(policy: nn.Module) -> list[tuple[str, BaseEncoderExtractor]]:
@@ -34,6 +36,26 @@ def require_weights(model: BaseAlgorithm) -> None:
             extractor.require_weights()
 
 
+def is_extractor(extractor: Any) -> bool:
+    """Whether something is a features extractor class of ours, for one image or for a dictionary.
+
+    :param extractor: ``features_extractor_class``
+    """
+    return isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor | CombinedEncoderExtractor)
+
+
+def encoders_of(extractor: type, kwargs: Mapping[str, Any]) -> list[tuple[str, str | None]]:
+    """The encoder files that a features extractor of ours is given, and the network that each is to have.
+
+    :param extractor: its class
+    :param kwargs: ``features_extractor_kwargs``
+    """
+    if issubclass(extractor, CombinedEncoderExtractor):
+        networks = kwargs.get("networks") or {}
+        return [(name, networks.get(key, {}).get("network")) for key, name in kwargs["encoders"].items()]
+    return [] if kwargs.get("encoder") is None else [(kwargs["encoder"], kwargs.get("network"))]
+
+
 def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> None:
     """Refuse a model whose extractors are not those that ``policy_kwargs`` would build.
 
@@ -46,21 +68,27 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
     """
     asked_class = policy_kwargs.get("features_extractor_class")
     kwargs = policy_kwargs.get("features_extractor_kwargs") or {}
-    here, hash, absent = "none of our extractors", None, False
+    here, absent = set(), False
     if asked_class is not None:
-        if not (isinstance(asked_class, type) and issubclass(asked_class, BaseEncoderExtractor)):
+        if not is_extractor(asked_class):
             return
-        if issubclass(asked_class, PretrainedExtractor):
-            try:
-                hash = load_encoder(kwargs["encoder"], kwargs.get("network")).hash
-            except EncoderNotFoundError:
-                absent = True
-        here = _name(asked_class, bool(kwargs.get("freeze", False)), hash)
+        each_class = EncoderExtractor if issubclass(asked_class, CombinedEncoderExtractor) else asked_class
+        hashes = [_hash_of(encoder, network) for encoder, network in encoders_of(asked_class, kwargs)] or [None]
+        absent = None in hashes and issubclass(each_class, PretrainedExtractor)
+        frozen = bool(kwargs.get("freeze", False))
+        here = {_name(each_class, frozen, None if absent else hash) for hash in hashes}
     extractors = [extractor for _, extractor in find_extractors(model.policy)]
     there = {_name(type(each), each.frozen, None if absent else each.hash) for each in extractors}
-    there = there or {"none of our extractors"}
-    if there != {here}:
-        raise ValueError(f"it was trained with {' and '.join(sorted(there))}, not with {here}")
+    if there != here:
+        sides = (" and ".join(sorted(side)) or "none of our extractors" for side in (there, here))
+        raise ValueError("it was trained with {}, not with {}".format(*sides))
+
+
+def _hash_of(encoder: str, network: str | None) -> str | None:
+    try:
+        return load_encoder(encoder, network).hash
+    except EncoderNotFoundError:
+        return None
 
 
 def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None) -> str:

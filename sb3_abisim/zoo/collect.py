@@ -17,7 +17,8 @@ from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.merge import merge_encoder
 from sb3_abisim.rl.vec_encode import EncodedBox
-from sb3_abisim.zoo.methods import PREPROCESSING_KEYS, hyperparameters_entry, normalizes_observations, read_entries
+from sb3_abisim.zoo.methods import hyperparameters_entry, read_entries
+from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, normalizes_observations, other_vec_wrappers
 from sb3_abisim.zoo.runs import read_run
 
 
@@ -27,7 +28,8 @@ def preprocessing_entry(env_id: str, conf_file: str | None = None) -> dict[str, 
     :param env_id: any id
     :param conf_file: a YAML file of the zoo's form; None for this package's and rl-zoo3's own
     :return: ``env_wrapper``, ``frame_stack`` and ``env_kwargs``, those that are given
-    :raises ValueError: if the file has no entry of this id, or normalizes observations
+    :raises ValueError: if the file has no entry of this id, or normalizes observations, or the entry has a
+        ``vec_env_wrapper``
     """
     if conf_file is not None:
         entries = read_entries(Path(conf_file))
@@ -41,6 +43,12 @@ def preprocessing_entry(env_id: str, conf_file: str | None = None) -> dict[str, 
         raise ValueError(
             f"--conf-file {conf_file} normalizes the observations of {env_id}, which would no longer be uint8 images; "
             'give normalize: "dict(norm_obs=False, norm_reward=True)"'
+        )
+    others = other_vec_wrappers(entry)
+    if others:
+        raise ValueError(
+            f"the entry of {env_id} has the vec_env_wrapper {', '.join(others)}, and data is collected without such; "
+            "give what it does as env_wrapper, or leave it out of a --conf-file of yours"
         )
     keys = {*PREPROCESSING_KEYS, "env_kwargs"} - {"normalize"}
     return {key: entry[key] for key in sorted(keys) if entry.get(key)}

@@ -35,21 +35,20 @@ from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
-from sb3_abisim.rl.checks import check_trained_with, find_extractors
+from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
-from sb3_abisim.rl.extractors import BaseEncoderExtractor
 from sb3_abisim.zoo.methods import (
-    PREPROCESSING_KEYS,
     MethodRecord,
     MethodSpec,
-    check_preprocessing,
     encoding_kwargs,
     hyperparameters_entry,
     hyperparameters_file,
-    normalizes_observations,
+    policy_of,
     resolve_classes,
     zoo_hyperparams,
 )
+from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
+from sb3_abisim.zoo.spaces import check_spaces
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
 exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
@@ -67,6 +66,8 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     config: str
     custom_hyperparams: dict[str, Any] | None
     env_kwargs: dict[str, Any]
+    env_wrapper: Any
+    frame_stack: int | None
     eval_env_kwargs: dict[str, Any]
     vec_env_class: type
     _hyperparams: dict[str, Any]
@@ -93,25 +94,31 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         if self._spec is not None:
             custom = self.custom_hyperparams or {}
             entry = hyperparameters_entry(self.algo, env_id)
-            self.custom_hyperparams = {**custom, **self._spec.hyperparameters(entry, custom)}
+            replaced = self._spec.hyperparameters(entry, custom)
+            if "policy" in replaced:
+                replaced["policy"] = policy_of(self.algo, replaced["policy"])
+            self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
-        self._check_embeddings(hyperparams)
+        self._check_normalize(hyperparams)
         self._set_batched_vec_env(hyperparams)
         self._set_eval_env_kwargs(hyperparams)
         return hyperparams, saved_hyperparams
 
-    def _check_embeddings(self, hyperparams: dict[str, Any]) -> None:
-        """Refuse what would change embeddings, and make them on the device of ``--device``."""
-        if encoding_kwargs(hyperparams) is None:
+    def _check_normalize(self, hyperparams: dict[str, Any]) -> None:
+        """Refuse what would change images or embeddings; make embeddings on the device of ``--device``."""
+        encoding = encoding_kwargs(hyperparams)
+        if encoding is None and self._spec is None:
             return
-        # A copy: config.yml names the device as little as it does for the rest of the run.
-        hyperparams["vec_env_wrapper"] = copy.deepcopy(hyperparams["vec_env_wrapper"])
-        (encoding_kwargs(hyperparams) or {}).setdefault("device", str(self.device))
         if normalizes_observations(hyperparams.get("normalize", False)):
+            what = "images" if encoding is None else "embeddings of the frozen encoder"
             raise ValueError(
-                f"normalize={hyperparams['normalize']!r} would change the embeddings of the frozen encoder; give "
-                '"dict(norm_obs=False, norm_reward=True)"'
+                f"normalize={hyperparams['normalize']!r} would change the {what}; give "
+                '"dict(norm_obs=False, norm_reward=True)": -params "normalize:{norm_obs: false, norm_reward: true}"'
             )
+        if encoding is not None:
+            # A copy: config.yml names the device as little as it does for the rest of the run.
+            hyperparams["vec_env_wrapper"] = copy.deepcopy(hyperparams["vec_env_wrapper"])
+            (encoding_kwargs(hyperparams) or {}).setdefault("device", str(self.device))
 
     def _set_batched_vec_env(self, hyperparams: dict[str, Any]) -> None:
         """Step copies as one batch where that gives the same as ``DummyVecEnv``; any other choice stays."""
@@ -147,6 +154,31 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         self._policy_kwargs: dict[str, Any] = dict(processed.get("policy_kwargs") or {})
         return processed, *rest
 
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> Any:
+        """As rl-zoo3 does; what Stable-Baselines3 does not take is refused.
+
+        :param n_envs: number of copies
+        :param eval_env: whether they are for evaluation
+        :param no_log: whether to write no monitor files
+        :raises ValueError: see :func:`~sb3_abisim.zoo.spaces.check_spaces`
+        """
+        outer, stack = self.env_wrapper, self.frame_stack
+
+        def wrap(env: Any) -> Any:
+            env = env if outer is None else outer(env)
+            try:
+                check_spaces(env, stack)
+            except ValueError:
+                env.close()
+                raise
+            return env
+
+        self.env_wrapper = wrap
+        try:
+            return super().create_envs(n_envs, eval_env, no_log)
+        finally:
+            self.env_wrapper = outer
+
     def create_log_folder(self) -> None:
         """As rl-zoo3 does, unless the encoder is missing."""
         self._record = self._make_record()
@@ -159,22 +191,25 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             file = load_encoder(encoding["encoder"])
             check_preprocessing(file, self._used, frozen=True)
             return MethodRecord(file.metadata["objective"], True, str(encoding["encoder"]), file.hash, preprocessing)
-        extractor = self._policy_kwargs.get("features_extractor_class")
-        if not (isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor)):
+        extractor: Any = self._policy_kwargs.get("features_extractor_class")
+        if not is_extractor(extractor):
             return MethodRecord(None, False, None, None, preprocessing)
         kwargs = self._policy_kwargs.get("features_extractor_kwargs") or {}
-        encoder, hash, method = kwargs.get("encoder"), None, method_of(extractor)
-        if encoder is not None:
+        method = method_of(extractor)
+        names, hashes = [], []
+        for encoder, network in encoders_of(extractor, kwargs):
+            names.append(str(encoder))
             try:
-                file = load_encoder(encoder, kwargs.get("network"))
+                file = load_encoder(encoder, network)
                 check_preprocessing(file, self._used)
-                hash, method = file.hash, method or str(file.metadata["objective"])
+                hashes.append(file.hash)
+                method = method or str(file.metadata["objective"])
             except EncoderNotFoundError:
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
-        name = None if encoder is None else str(encoder)
-        return MethodRecord(method, bool(kwargs.get("freeze", False)), name, hash, preprocessing)
+        frozen = bool(kwargs.get("freeze", False))
+        return MethodRecord(method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does.
@@ -209,7 +244,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     def hyperparameters_optimization(self) -> None:
         """As rl-zoo3 does, except that an extractor of ours survives a trial's ``policy_kwargs``."""
         extractor = (self._hyperparams.get("policy_kwargs") or {}).get("features_extractor_class")
-        if isinstance(extractor, type) and issubclass(extractor, BaseEncoderExtractor):
+        if is_extractor(extractor):
             self._hyperparams = _KeepExtractor(self._hyperparams)
         MethodExperimentManager.has_begun = True
         super().hyperparameters_optimization()

@@ -4,7 +4,7 @@ import importlib
 import importlib.util
 import json
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,11 @@ import yaml
 
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.data.environments import VEC_ENV_KEY
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
-from sb3_abisim.rl.file_network import network_arguments
+from sb3_abisim.rl.combined import CombinedEncoderExtractor
+from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
+from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_stack_of, items
 
 ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
 ENCODER_CALLBACK = "sb3_abisim.EncoderCallback"
@@ -82,33 +83,39 @@ class MethodSpec:
             )
         return None
 
-    def hyperparameters(self, entry: Mapping[str, Any], given: Collection[str] = ()) -> dict[str, Any]:
+    def hyperparameters(self, entry: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """What this method puts in place of an entry's values; all else stays.
 
         :param entry: of a zoo YAML
-        :param given: names of hyperparameters that the user sets
+        :param given: hyperparameters that the user sets
         :return: ``policy_kwargs``, unless the entry gives them as a text: :meth:`policy_kwargs` takes them once rl-zoo3
-            has evaluated it; ``policy`` and, for a frozen encoder, ``vec_env_wrapper``; ``callback``, where the entry
-            has no ``EncoderCallback``
-        :raises ValueError: when the method has no encoder, the policy takes none, or the method sets what the user sets
+            has evaluated it; ``policy`` and, for a frozen encoder, ``vec_env_wrapper``; ``frame_stack``, where a frozen
+            encoder's observations are stacked before it; ``callback``, where the entry has no ``EncoderCallback``
+        :raises ValueError: when the method has no encoder, the policy takes none, the method sets what the user sets,
+            or a frozen encoder would be shown other stacks than in pretraining
         """
+        given = given or {}
         replaced: dict[str, Any] = {}
         kwargs, encoder = entry.get("policy_kwargs") or {}, None
         if isinstance(kwargs, Mapping):
             encoder = _encoder_name(kwargs)
             replaced["policy_kwargs"] = self.policy_kwargs(kwargs)
-        if self.frozen:
+        file = self._file(encoder)
+        if self.frozen and _image_key(file) is None:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
-            replaced["vec_env_wrapper"] = [*_items(entry.get("vec_env_wrapper")), wrapper]
-            if entry.get("frame_stack") and "frame_stack" not in given and _stacks(self._encoder(encoder)):
-                # The wrapper stacks observations; rl-zoo3 would stack embeddings once more.
-                replaced["frame_stack"] = None
+            replaced["vec_env_wrapper"] = [*items(entry.get("vec_env_wrapper")), wrapper]
         if self.frozen or "policy" not in given:
-            replaced["policy"] = self._policy(str(entry.get("policy")))
+            replaced["policy"] = self._policy(str(entry.get("policy")), _image_key(file))
         for name in sorted({"policy_kwargs", *replaced} & set(given)):
             raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
-        callbacks = _items(entry.get("callback"))
-        if "callback" not in given and ENCODER_CALLBACK.rpartition(".")[2] not in map(_class_name, callbacks):
+        settings = {**entry, **given}
+        if "vec_env_wrapper" in replaced and file is not None and (settings.get("frame_stack") or 1) > 1:
+            if frame_stack_of(file) != settings["frame_stack"]:
+                check_preprocessing(file, settings, frozen=True)
+            # The wrapper stacks observations; rl-zoo3 would stack embeddings once more.
+            replaced["frame_stack"] = None
+        callbacks = items(entry.get("callback"))
+        if "callback" not in given and ENCODER_CALLBACK.rpartition(".")[2] not in map(class_name, callbacks):
             replaced["callback"] = [*callbacks, ENCODER_CALLBACK]
         return replaced
 
@@ -121,12 +128,20 @@ class MethodSpec:
         """
         replaced = {name: value for name, value in kwargs.items() if not name.startswith("features_extractor_")}
         method = get_method(self.name)
-        if self.frozen:
-            return replaced
-        replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
-        if method.has_encoder_file:
-            encoder = self._encoder(_encoder_name(kwargs))
-            replaced["features_extractor_kwargs"] = {"encoder": encoder, **_network_arguments(encoder)}
+        shipped = _encoder_name(kwargs)
+        file = self._file(shipped)
+        key = _image_key(file)
+        if file is not None and key is not None:
+            # Of a Dict: an encoder for its image, and everything else passed on.
+            check_objective(file, self.name)
+            replaced["features_extractor_class"] = f"sb3_abisim.{CombinedEncoderExtractor.__name__}"
+            arguments = {"encoders": {key: self._encoder(shipped)}, "networks": {key: stored_network(file)}}
+            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen}
+        elif not self.frozen:
+            replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
+            if method.has_encoder_file:
+                arguments = {} if file is None else network_arguments(file)
+                replaced["features_extractor_kwargs"] = {"encoder": self._encoder(shipped), **arguments}
         return replaced
 
     def _encoder(self, shipped: str | None) -> str:
@@ -139,7 +154,19 @@ class MethodSpec:
             )
         return f"{shipped.rpartition('/')[0]}/{self.name}"
 
-    def _policy(self, policy: str) -> str:
+    def _file(self, shipped: str | None) -> EncoderFile | None:
+        """The encoder's file; None for a method without one, or where it is not there: whoever needs it says so."""
+        if not get_method(self.name).has_encoder_file:
+            return None
+        try:
+            return load_encoder(self._encoder(shipped))
+        except EncoderNotFoundError:
+            # A saved model that is continued is complete without it.
+            return None
+
+    def _policy(self, policy: str, image_key: str | None) -> str:
+        if image_key is not None:
+            return re.sub("Mlp|Cnn", "MultiInput", policy)
         # An entry for vectors, as rl-zoo3's "default" is, has the policy without an extractor for images.
         wrong, right = ("Cnn", "Mlp") if self.frozen else ("Mlp", "Cnn")
         replaced = policy.replace(wrong, right)
@@ -199,35 +226,6 @@ class MethodRecord:
             raise ValueError(f"{path} is damaged ({error}); leave the run out, or copy the file again") from error
 
 
-PREPROCESSING_KEYS = ("env_wrapper", "frame_stack", "normalize")
-
-
-def check_preprocessing(file: EncoderFile, settings: Mapping[str, Any], frozen: bool = False) -> None:
-    """Refuse hyperparameters that show an encoder something else than it was pretrained on.
-
-    :param file: of the encoder; one that records no preprocessing is left to the check of spaces
-    :param settings: a zoo entry's hyperparameters
-    :param frozen: whether the encoder stacks observations by itself
-    :raises ValueError: naming both sides
-    """
-    recorded = file.metadata["preprocessing"]
-    if VEC_ENV_KEY in recorded:
-        raise ValueError(
-            f"{file.path} was pretrained on what {' of '.join(recorded[VEC_ENV_KEY])} shows, which the zoo cannot "
-            "make; train in Python on such an environment, or collect by the environment's id and pretrain again"
-        )
-    there = {"env_wrapper": _items(recorded.get("env_wrapper")), "frame_stack": recorded.get("frame_stack", 1)}
-    here = {"env_wrapper": _items(settings.get("env_wrapper")), "frame_stack": settings.get("frame_stack") or 1}
-    names = ["env_wrapper"] if frozen else ["env_wrapper", "frame_stack"]
-    different = [name for name in names if there[name] != here[name]]
-    if recorded and different:
-        sides = "; ".join(f"{name}: {there[name]} in pretraining, {here[name]} now" for name in different)
-        raise ValueError(
-            f"{file.path} was pretrained on other observations ({sides}); give the same with -params or --conf-file, "
-            "or collect and pretrain again"
-        )
-
-
 def hyperparameters_file(algo: str, env_id: str) -> Path | None:
     """The YAML file of this package with hyperparameters of an algorithm for an environment.
 
@@ -267,6 +265,26 @@ def hyperparameters_entry(algo: str, env_id: str) -> dict[str, Any]:
         if name in entries:
             return dict(entries[name])
     raise ValueError(f"rl-zoo3 has no hyperparameters of {algo} for {env_id}; choose another with --algo")
+
+
+def policy_of(algo: str, policy: str) -> str:
+    """The algorithm's policy of a kind, which rl-zoo3's default entry for RecurrentPPO calls as PPO does.
+
+    :param algo: rl-zoo3's name of the algorithm
+    :param policy: such as "MlpPolicy", or the dotted path of a custom one
+    :return: such as "MlpLstmPolicy"
+    :raises ValueError: when there is none
+    """
+    from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]
+
+    known = ALGOS[algo].policy_aliases
+    if "." in policy or policy in known:
+        return policy
+    kind = re.match("Cnn|Mlp|MultiInput", policy)
+    found = [name for name in known if kind is not None and name.startswith(kind[0])]
+    if len(found) != 1:
+        raise ValueError(f"{algo} has no policy {policy!r}, only {', '.join(known)}; choose another with --algo")
+    return str(found[0])
 
 
 def zoo_hyperparams() -> Path:
@@ -311,22 +329,11 @@ def encoding_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any] | None:
 
     :param hyperparams: of a zoo entry, or of a run's ``config.yml``
     """
-    for wrapper in _items(hyperparams.get("vec_env_wrapper")):
-        if isinstance(wrapper, dict) and _class_name(wrapper) == ENCODING_WRAPPER.rpartition(".")[2]:
+    for wrapper in items(hyperparams.get("vec_env_wrapper")):
+        if isinstance(wrapper, dict) and class_name(wrapper) == ENCODING_WRAPPER.rpartition(".")[2]:
             kwargs: dict[str, Any] = next(iter(wrapper.values()))
             return kwargs
     return None
-
-
-def _items(value: Any) -> list[Any]:
-    """The items of a zoo entry's ``vec_env_wrapper`` or ``callback``, which may be one, several or None."""
-    return value if isinstance(value, list) else [] if value is None else [value]
-
-
-def _class_name(item: Any) -> str:
-    """The name of the class that an item of :func:`_items` names, with or without arguments."""
-    name = next(iter(item), "") if isinstance(item, dict) else item
-    return str(getattr(name, "__name__", name)).rpartition(".")[2]
 
 
 def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:
@@ -334,28 +341,7 @@ def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:
     return None if encoder is None else str(encoder)
 
 
-def _network_arguments(encoder: str) -> dict[str, Any]:
-    try:
-        return network_arguments(load_encoder(encoder))
-    except EncoderNotFoundError:
-        # Whoever needs the file says so; a saved model that is continued is complete without it.
-        return {}
-
-
-def _stacks(encoder: str) -> bool:
-    """Whether an encoder was pretrained on stacks of observations."""
-    try:
-        return bool(load_encoder(encoder).metadata["preprocessing"].get("frame_stack", 1) > 1)
-    except EncoderNotFoundError:
-        return False  # whoever needs the file says so
-
-
-def normalizes_observations(normalize: Any) -> bool:
-    """Whether the zoo's ``normalize`` makes VecNormalize change observations.
-
-    :param normalize: of a zoo entry: a bool, a dictionary, or the text of either
-    """
-    if isinstance(normalize, dict):
-        return bool(normalize.get("norm_obs", True))
-    text = str(normalize or False)
-    return text not in ("False", "None") and re.search(r"norm_obs['\"]?\s*[=:]\s*False", text) is None
+def _image_key(file: EncoderFile | None) -> str | None:
+    """Which key of a Dict an encoder was pretrained on; None for observations that are one image."""
+    key = None if file is None else file.metadata["preprocessing"].get("image_key")
+    return None if key is None else str(key)

@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 
 from sb3_abisim.common.cli import make_parser, run
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_traits
-from sb3_abisim.zoo.evaluate import final_model, split_kwargs
+from sb3_abisim.zoo.run_envs import final_model, make_run_env, split_kwargs
 from sb3_abisim.zoo.runs import read_run
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
     :return: share of the recorded episodes that were successful
     :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
     """
-    import gymnasium as gym
     from stable_baselines3.common.utils import set_random_seed
 
     if n_episodes < 1:
@@ -49,28 +49,65 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
     zoo_run = read_run(run_folder)
     model = final_model(zoo_run)
     kwargs = split_kwargs(zoo_run.env_id, zoo_run.env_kwargs, get_traits(zoo_run.env_id).eval_split)
-    env = gym.make(zoo_run.env_id, render_mode="rgb_array", **kwargs)
+    camera = _Camera()
+    env = make_run_env(zoo_run, model, 1, {**kwargs, "render_mode": "rgb_array"}, seed, camera.watch)
     set_random_seed(seed)
     frames: list[Image.Image] = []
     successes = 0
     try:
         for episode in range(n_episodes):
-            observation, _ = env.reset(seed=seed + episode)
-            shown, done = [_frame(env.render())], False
+            env.seed(seed + episode)
+            observation: Any = env.reset()
             state: Any = None
-            while not done:
-                episode_start = np.array([state is None])
-                action, state = model.predict(observation, state, episode_start, deterministic=False)
-                observation, _, terminated, truncated, info = env.step(action)
-                shown.append(_frame(env.render()))
-                done = terminated or truncated
+            started, info = np.ones(1, bool), dict[str, Any]()
+            # Wrappers may end episodes within an episode, as Atari's do where a life is lost.
+            while "episode" not in info:
+                action, state = model.predict(observation, state, started, deterministic=False)
+                observation, _, started, (info,) = env.step(action)
             successes += bool(info.get("is_success", False))
+            shown = camera.last_episode
             frames += shown[:: -(-len(shown) // MAX_FRAMES)] + [shown[-1]] * (N_LAST - 1)
     finally:
         env.close()
     rest = {"save_all": True, "append_images": frames[1:], "duration": MILLISECONDS, "loop": 0}
     write_atomic(Path(path), lambda file: frames[0].save(file, format="GIF", **rest))
     return successes / n_episodes
+
+
+class _Camera:
+    """Keeps what an environment renders: of the present episode, and of the last one that ended."""
+
+    def __init__(self) -> None:
+        self.last_episode: list[Image.Image] = []
+        self._shown: list[Image.Image] = []
+
+    def watch(self, env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        """Wrap the environment."""
+        return _Watched(env, self)
+
+    def begin(self, rendered: Any) -> None:
+        """The first frame of an episode."""
+        self.last_episode, self._shown = self._shown, [_frame(rendered)]
+
+    def add(self, rendered: Any) -> None:
+        """The next frame."""
+        self._shown.append(_frame(rendered))
+
+
+class _Watched(gym.Wrapper[Any, Any, Any, Any]):
+    def __init__(self, env: gym.Env[Any, Any], camera: _Camera) -> None:
+        super().__init__(env)
+        self._camera = camera
+
+    def reset(self, **kwargs: Any) -> Any:
+        outcome = self.env.reset(**kwargs)
+        self._camera.begin(self.env.render())
+        return outcome
+
+    def step(self, action: Any) -> Any:
+        outcome = self.env.step(action)
+        self._camera.add(self.env.render())
+        return outcome
 
 
 def _frame(rendered: Any) -> "Image.Image":

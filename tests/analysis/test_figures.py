@@ -146,7 +146,7 @@ def test_all_makes_the_usual_ones(monkeypatch, tmp_path):
     made = []
     monkeypatch.setattr(analyze, "make_figure", lambda name, files, env_id, n, *rest: made.append((name, env_id, n)))
     monkeypatch.setattr(analyze, "make_sweep", lambda values, *rest: made.append(("sweep", tuple(values), rest[3])))
-    monkeypatch.setattr(analyze, "load_all", lambda names, env_id: {})
+    monkeypatch.setattr(analyze, "load_all", lambda names, *rest: {})
     figures = {name: dataclasses.replace(one) for name, one in FIGURES.items() if name != "probes"}
     monkeypatch.setattr(analyze, "FIGURES", figures)
     analyze.main(["all", "--images", str(tmp_path)])

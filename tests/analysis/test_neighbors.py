@@ -69,7 +69,9 @@ def test_encoder_of_one_channel_finds_its_like():
 def test_any_image_environment_has_neighbors():
     """Of one without factors, the embeddings alone are compared."""
     layers = Masked(np.ones(INDEX_SHAPE))
-    file = EncoderFile(Path("nowhere"), "0" * 64, Encoder(layers, 60, "none", {}, INDEX_SHAPE), {})
+    file = EncoderFile(
+        Path("nowhere"), "0" * 64, Encoder(layers, 60, "none", {}, INDEX_SHAPE), {"preprocessing": {}, "env_id": ""}
+    )
     results = neighbors({"pixels": file}, "PlainEnv-v0", 30)
     (numbers,) = results["settings"].values()
     assert list(results["settings"]) == ["eval episodes"]

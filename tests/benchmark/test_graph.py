@@ -7,12 +7,14 @@ from pathlib import Path
 import gymnasium as gym
 import index_env  # noqa: F401  (registers environments)
 import pytest
+import toy_env  # noqa: F401
 from zoo_inputs import write_encoder
 
 from sb3_abisim.benchmark import graph
 from sb3_abisim.benchmark.graph import build, run_labels
 from sb3_abisim.benchmark.jobs.job import Job
 from sb3_abisim.benchmark.plan import Plan
+from sb3_abisim.common.cli import parse_value
 
 PLAN = Plan(methods=("abisim", "ssi", "vanilla"), env_ids=("Nav2D-v0", "DistractorPointMaze-v0"), seeds=(0, 1))
 
@@ -178,12 +180,12 @@ def test_distractors_are_evaluated_on_three_splits() -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"methods": ("abisim=Nav2D-v0/abisim", "vanilla"), "params": ("env_kwargs:dict(max_episode_steps=20)",)},
-        {"params": ("ppo.normalize:True",), "final_episodes": 0},
+        {"methods": ("abisim=Nav2D-v0/abisim", "vanilla"), "params": ("env_kwargs:{max_episode_steps: 20}",)},
+        {"params": ("ppo.normalize:{norm_obs: false}",)},
     ],
 )
 def test_settings_that_nothing_else_would_miss(changes: dict[str, object]) -> None:
-    """Arguments of environments where nothing is pretrained, and wrappers where no final evaluation is made."""
+    """Arguments of environments, and normalized rewards."""
     assert build(dataclasses.replace(PLAN, **{"env_ids": ("Nav2D-v0",), "algo": "ppo", **changes}))
 
 
@@ -198,9 +200,11 @@ def test_settings_that_nothing_else_would_miss(changes: dict[str, object]) -> No
         ({"n_timesteps": 0}, "n_timesteps must be at least 1, got 0"),
         ({"algo": "sac"}, "no hyperparameters of sac for Nav2D-v0"),
         ({"params": ("sac.gamma:0.9",)}, "--params sac.gamma:0.9 is for sac, but here is only dqn, ppo"),
-        ({"params": ("env_kwargs:dict(color_jitter=False)",)}, "would hold for RL, but not for the data"),
-        ({"params": ("frame_stack:2",)}, "dqn has no hyperparameter 'frame_stack'"),
-        ({"params": ("ppo.normalize:True",)}, "evaluation is made without normalize; .* --final-episodes 0"),
+        ({"params": ("env_kwargs:dict(color_jitter=False)",)}, "env_kwargs must be a mapping such as"),
+        ({"params": ("env_kwargs:{split: clean}",)}, "env_kwargs split would choose what data for pretraining"),
+        ({"params": ("frame_stacks:2",)}, "dqn has no hyperparameter 'frame_stacks'"),
+        ({"params": ("ppo.normalize:True",)}, r"normalize observations \(True\), .*'norm_obs': False"),
+        ({"params": ("vec_env_wrapper:some.Stack",)}, "have the vec_env_wrapper some.Stack, and data .* METHOD=FILE"),
         ({"pretrain_params": ("curl.n_updates:3",)}, "curl.n_updates:3 is for curl, but here is only abisim, ssi"),
         ({"params": ("gamma",)}, "name:value, got 'gamma'"),
         ({"params": ("dqn.learning_rat:1e-4",)}, "dqn has no hyperparameter 'learning_rat', only .*learning_rate"),
@@ -256,17 +260,39 @@ def test_algorithms_are_those_of_rl_zoo3(algo: str) -> None:
         build(dataclasses.replace(plan, params=("ppo.gamma:0.9",)))
 
 
-def test_hyperparameters_with_wrappers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As rl-zoo3's are for Atari: data is collected and final models are evaluated without."""
-    entry = {"n_timesteps": 1e7, "policy": "CnnPolicy", "env_wrapper": ["a.Wrapper"], "frame_stack": 4}
+def test_wrappers_and_stacks_of_the_runs_are_those_of_the_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As rl-zoo3's entries have them for Atari."""
+    plain = build(dataclasses.replace(OTHERS, env_ids=("PlainEnv-v0",)))
+    skip = {"rl_zoo3.wrappers.FrameSkip": {"skip": 2}}
+    entry = {"n_timesteps": 1e7, "policy": "CnnPolicy", "env_wrapper": ["a.Wrapper", skip], "frame_stack": 4}
     monkeypatch.setattr(graph, "hyperparameters_entry", lambda algo, env_id: dict(entry))
-    with pytest.raises(
-        ValueError, match="have env_wrapper and frame_stack, and data for pretraining is collected without"
-    ):
-        build(dataclasses.replace(OTHERS, final_episodes=0))
-    vanilla = dataclasses.replace(OTHERS, methods=("vanilla",))
-    with pytest.raises(
-        ValueError, match=r"final evaluation is made without env_wrapper, frame_stack; .*--final-episodes 0"
-    ):
-        build(vanilla)
-    assert len(build(dataclasses.replace(vanilla, final_episodes=0))) == 1
+    jobs = build(OTHERS)
+    (data,) = (job for job in jobs if job.kind == "data")
+    assert {name: data.settings[name] for name in ("env_wrapper", "frame_stack", "env_kwargs")} == {
+        "env_wrapper": ["a.Wrapper", skip],
+        "frame_stack": 4,
+        "env_kwargs": {},
+    }
+    words = data.command[data.command.index("--env-wrapper") :]
+    assert words[:5] == ("--env-wrapper", "a.Wrapper", str(skip), "--frame-stack", "4")
+    assert [parse_value(word) for word in words[1:3]] == ["a.Wrapper", skip]
+    assert not names(jobs) & names(plain)
+    # What --params says holds for both.
+    jobs = build(dataclasses.replace(OTHERS, params=("frame_stack:3", "env_wrapper:None", "env_kwargs:{scale: 2}")))
+    (data,) = (job for job in jobs if job.kind == "data")
+    assert data.settings["frame_stack"] == 3 and "env_wrapper" not in data.settings
+    assert data.command[7:12] == (data.output, "--env-kwargs", "scale:2", "--frame-stack", "3")
+    # What collect would do by itself is said not to be done.
+    monkeypatch.setattr(graph, "preprocessing_entry", lambda env_id: {"env_wrapper": ["b.Other"], "frame_stack": 2})
+    monkeypatch.setattr(graph, "hyperparameters_entry", lambda algo, env_id: {"n_timesteps": 1, "policy": "CnnPolicy"})
+    (data,) = (job for job in build(OTHERS) if job.kind == "data")
+    assert data.command[8:12] == ("--env-wrapper", "none", "--frame-stack", "1")
+
+
+def test_an_encoder_of_other_wrappers_is_refused_before_any_job(tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    write_encoder(path, "Toy-v0", "ssi", preprocessing={"env_wrapper": ["a.B"]})
+    plan = dataclasses.replace(OTHERS, env_ids=("Toy-v0",), methods=(f"ssi={path}",))
+    with pytest.raises(ValueError, match=r"env_wrapper: \['a.B'\] in pretraining, \[\] now.*add -params"):
+        build(plan)
+    assert build(dataclasses.replace(plan, params=("env_wrapper:a.B",)))

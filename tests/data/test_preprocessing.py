@@ -161,6 +161,8 @@ def test_the_zoo_entry_of_an_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     main([*words, str(tmp_path / "e"), "--frame-stack", "1", "--env-kwargs", "form:first"])
     dataset = TransitionDataset(tmp_path / "e")
     assert dataset.preprocessing == {"env_wrapper": [DARKEN]}
+    main([*words, str(tmp_path / "f"), "--frame-stack", "1", "--env-wrapper", "none"])
+    assert TransitionDataset(tmp_path / "f").preprocessing == {"channels": "last"}
     with pytest.raises(ValueError, match="has no entry Other-v0, only Forms-v0"):
         preprocessing_entry("Other-v0", str(mine))
 
@@ -178,7 +180,7 @@ def test_from_channels_last_to_an_agent(tmp_path: Path, frame_stack: int) -> Non
         _register_stacked()
     path = pretrain("ssi", tmp_path / "d", tmp_path / "e.safetensors", config, progress_bar=False, verbose=0)
     file = load_encoder(path)
-    expected = {"channels": "last"} | ({"frame_stack": frame_stack} if frame_stack > 1 else {})
+    expected = {"channels": "last", "env_wrapper": []} | ({"frame_stack": frame_stack} if frame_stack > 1 else {})
     assert file.metadata["preprocessing"] == expected
     assert file.metadata["observation_space"]["shape"] == [3 * frame_stack, HEIGHT, WIDTH]
     venv = DummyVecEnv([lambda: gym.make("Forms-v0")])

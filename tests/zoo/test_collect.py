@@ -9,7 +9,7 @@ from zoo_inputs import run, write_encoder
 
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.networks.encoder_file import EncoderFile
-from sb3_abisim.zoo.methods import check_preprocessing
+from sb3_abisim.zoo.preprocessing import check_preprocessing
 
 WORDS = ["-params", "n_envs:2", "n_steps:32", "batch_size:32", "--eval-freq", "-1", "-n", "64", "--verbose", "0"]
 

@@ -123,10 +123,10 @@ def test_what_the_user_sets_beside_a_method() -> None:
         (MethodSpec("ssi", None, True), ENTRY, "vec_env_wrapper"),
     ):
         with pytest.raises(ValueError, match=f"-params {name} would undo --conf-file ssi; give one of the two"):
-            spec.hyperparameters(entry, [name])
+            spec.hyperparameters(entry, {name: None})
     # Theirs are kept.
-    assert "policy" not in MethodSpec("ssi").hyperparameters(ENTRY, ["policy", "gamma"])
-    assert "callback" not in MethodSpec("ssi", "f").hyperparameters(text, ["callback"])
+    assert "policy" not in MethodSpec("ssi").hyperparameters(ENTRY, {"policy": "p", "gamma": 1})
+    assert "callback" not in MethodSpec("ssi", "f").hyperparameters(text, {"callback": "c"})
 
 
 def test_a_file_with_another_network_names_it(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import index_env  # noqa: F401  (registers IndexEnv-v0)
 import numpy as np
 import pytest
 import toy_env  # noqa: F401  (registers Toy-v0)
-from stable_baselines3.common.vec_env import VecFrameStack, unwrap_vec_wrapper
+from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 from torch import nn
 from zoo_inputs import SMALL, run, write_encoder
 
@@ -72,8 +72,11 @@ def test_an_entry_whose_policy_kwargs_are_a_text(tmp_path: Path, encoder: Path) 
         "features_extractor_kwargs": {"encoder": str(encoder)},
     }
     assert kwargs["policy_kwargs"] == plain["policy_kwargs"] | extractor
-    _, kwargs, _ = prepared(make(tmp_path, "ppo", "CarRacing-v3", f"ssi={encoder},frozen"))
+    write_encoder(tmp_path / "of_two.safetensors", "Toy-v0", "ssi", {"frame_stack": 2})
+    _, kwargs, frozen = prepared(make(tmp_path, "ppo", "CarRacing-v3", f"ssi={tmp_path / 'of_two.safetensors'},frozen"))
     assert kwargs["policy_kwargs"] == plain["policy_kwargs"] and kwargs["policy"] == "MlpPolicy"
+    # Stacked before the encoder, not behind it.
+    assert plain_saved["frame_stack"] == 2 and frozen["frame_stack"] is None
     # Whatever stands between environment and encoder is that of the entry.
     keys = ("env_wrapper", "frame_stack", "normalize", "n_envs", "gamma")
     assert {key: saved[key] for key in keys} == {key: plain_saved[key] for key in keys}
@@ -162,13 +165,39 @@ def test_the_encoder_stands_behind_the_wrappers_of_the_entry(tmp_path: Path, enc
     ((_, extractor),) = find_extractors(model.policy)
     assert extractor.hash == load_encoder(encoder).hash
     model.env.close()
-    # Embeddings of several steps are stacked behind the encoder.
-    small = {**small, "frame_stack": 2}
-    model, _ = make(
-        tmp_path, "ppo", "Toy-v0", f"ssi={encoder},frozen", hyperparams=small, eval_freq=-1
-    ).setup_experiment()
-    assert isinstance(model.env, VecFrameStack) and model.observation_space.shape == (64,)
-    model.env.close()
+
+
+def test_embeddings_are_not_stacked(tmp_path: Path, encoder: Path) -> None:
+    """rl-zoo3 stacks what comes out of ``vec_env_wrapper``: of a frozen encoder embeddings, not observations."""
+    small = {"n_steps": 8, "batch_size": 8}
+    single, of_two = f"ssi={encoder},frozen", tmp_path / "of_two.safetensors"
+    message = (
+        r"frame_stack: {} in pretraining, {} now, which would stack embeddings\); add -params frame_stack:None, or"
+    )
+    with pytest.raises(ValueError, match=message.format(1, 2)):
+        prepared(make(tmp_path, "ppo", "Toy-v0", single, hyperparams={"frame_stack": 2}))
+    write_encoder(of_two, "Toy-v0", "ssi", {"frame_stack": 2})
+    with pytest.raises(ValueError, match=message.format(2, 3)):
+        prepared(make(tmp_path, "ppo", "Toy-v0", f"ssi={of_two},frozen", hyperparams={"frame_stack": 3}))
+    # Nor by a YAML file of the user's.
+    wrapper = f"{{sb3_abisim.VecEncodeObservations: {{encoder: {encoder}}}}}"
+    settings = f"policy: MlpPolicy, n_timesteps: 8, frame_stack: 2, vec_env_wrapper: {wrapper}"
+    (tmp_path / "mine.yml").write_text(f"Toy-v0: {{{settings}}}")
+    with pytest.raises(ValueError, match=message.format(1, 2)):
+        make(tmp_path, "ppo", "Toy-v0", str(tmp_path / "mine.yml"), hyperparams=small, eval_freq=-1).setup_experiment()
+
+
+def test_wrappers_are_compared_with_those_of_pretraining(tmp_path: Path) -> None:
+    path = tmp_path / "e.safetensors"
+    small = {"n_steps": 8, "batch_size": 8}
+    write_encoder(path, "Toy-v0", "ssi", {"env_wrapper": []})
+    wrapped = {**small, "env_wrapper": "toy_env.Invert"}
+    for config in (f"ssi={path}", f"ssi={path},frozen"):
+        message = r"env_wrapper: \[\] in pretraining, \['toy_env.Invert'\] now\); add -params env_wrapper:None"
+        with pytest.raises(ValueError, match=message):
+            make(tmp_path, "ppo", "Toy-v0", config, hyperparams=dict(wrapped), eval_freq=-1).setup_experiment()
+        model, _ = make(tmp_path, "ppo", "Toy-v0", config, hyperparams=dict(small), eval_freq=-1).setup_experiment()
+        model.env.close()
 
 
 def test_a_file_with_another_network_needs_no_more_words(tmp_path: Path) -> None:

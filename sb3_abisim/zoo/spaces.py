@@ -1,0 +1,42 @@
+"""Spaces that Stable-Baselines3 does not take, refused before it fails at them, with what helps."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+_NUMBERS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+
+
+def check_spaces(env: gym.Env[Any, Any], frame_stack: int | None) -> None:
+    """Refuse an environment that Stable-Baselines3 cannot train in.
+
+    :param env: with its wrappers
+    :param frame_stack: of the zoo's entry
+    :raises ValueError: naming what is wrong, and the remedy
+    """
+    space, actions = env.observation_space, env.action_space
+    if isinstance(actions, spaces.Discrete | spaces.MultiDiscrete) and np.any(actions.start != 0):
+        raise ValueError(
+            f"Stable-Baselines3 counts actions from 0, and these do not: {actions}; register a variant of the "
+            "environment in gymnasium.wrappers.TransformAction"
+        )
+    parts = space.spaces if isinstance(space, spaces.Dict) else {}
+    for stacked, taken in ((False, _NUMBERS), (True, spaces.Box)):
+        others = {key: part for key, part in parts.items() if not isinstance(part, taken)}
+        if others and (not stacked or (frame_stack or 1) > 1):
+            what = "cannot be stacked" if stacked else "have no numbers"
+            kept = [key for key in parts if key not in others]
+            raise ValueError(
+                f"of the observations, {', '.join(f'{key} ({type(part).__name__})' for key, part in others.items())} "
+                f"{what}; keep the others only, in collect as here, by env_wrapper "
+                f"{{gymnasium.wrappers.FilterObservation: {{filter_keys: {kept}}}}}"
+            )
+    for key, part in (parts or {"the image": space}).items():
+        if isinstance(part, spaces.Box) and part.dtype == np.uint8 and len(part.shape) == 2:
+            raise ValueError(
+                f"Stable-Baselines3 takes images with channels, and {key} has none: {part}; add them, in collect as "
+                f"here, by env_wrapper {{gymnasium.wrappers.ReshapeObservation: {{shape: {[*part.shape, 1]}}}}} or "
+                "GrayscaleObservation: {keep_dim: true}"
+            )
