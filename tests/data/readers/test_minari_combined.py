@@ -11,7 +11,7 @@ import index_env
 import numpy as np
 import pytest
 
-from sb3_abisim.data import collect as collect_module
+from sb3_abisim.data import chains
 from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, TERMINATED
@@ -25,7 +25,7 @@ minari = pytest.importorskip("minari")
 @pytest.fixture(autouse=True)
 def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setattr(collect_module, "SHARD_TRANSITIONS", 48)
+    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", 48)
     return tmp_path / "minari"
 
 
