@@ -23,6 +23,8 @@ split.
 * `squared_error` of `beta_vae`: of the reconstruction, per intensity in 0..1. `kl` is in nats per observation.
 * `metric_loss` of `abisim`: mean squared difference between distance and target, the target's sampling noise included.
   With `pairs: nearest`, the difference is relative to the base distance, as in training. `distance` is the mean.
+* `progress_r2` of `goal_progress`: coefficient of determination of the progress towards all goals. `value_loss` is the
+  mean squared TD error of the values, which lie in 0..1.
 
 | encoder | transitions | updates | parameters | features | kB | result on the eval split |
 |---|---:|---:|---:|---:|---:|---|
