@@ -288,10 +288,11 @@ class TransitionDataset:
 
     def _stack_members(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """The frames of stacks, oldest first, [m, frame_stack]; -1 for what is before an episode's first."""
-        members = np.full((len(index), self.frame_stack), -1, np.int64)
+        members = np.empty((len(index), self.frame_stack), np.int64)
         members[:, -1] = frame = index.copy()
         for column in range(self.frame_stack - 2, -1, -1):
-            starts = np.flatnonzero((frame > 0) & (self._ends[frame - 1] != INSIDE) | (frame == 0))
+            # Before frame 0 stands the last one of all, which ends a segment, too.
+            starts = np.flatnonzero((frame >= 0) & (self._ends[frame - 1] != INSIDE))
             # The first frame of a segment that goes on with another is that one's last.
             before = self._before[np.searchsorted(self._last, frame[starts])]
             frame = np.maximum(frame - 1, -1)
