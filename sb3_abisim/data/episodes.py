@@ -68,10 +68,11 @@ def stack_members(
     :param last: the last frame of each segment
     :param before: of :func:`segments_before`
     """
-    members = np.full((len(index), n_stack), -1, np.int64)
+    members = np.empty((len(index), n_stack), np.int64)
     members[:, -1] = frame = index.copy()
     for column in range(n_stack - 2, -1, -1):
-        starts = np.flatnonzero((frame > 0) & (ends[frame - 1] != INSIDE) | (frame == 0))
+        # Before frame 0 stands the last one of all, which ends a segment, too.
+        starts = np.flatnonzero((frame >= 0) & (ends[frame - 1] != INSIDE))
         # The first frame of a segment that goes on with another is that one's last.
         goes_on = before[np.searchsorted(last, frame[starts])]
         frame = np.maximum(frame - 1, -1)

@@ -205,13 +205,17 @@ def test_batches_are_of_stacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_an_episode_is_in_one_split(tmp_path: Path) -> None:
-    dataset = collect_long(tmp_path / "d")
-    train, held_out = (dataset.valid_starts(split=split) for split in ("train", "eval"))
-    assert sorted([*train, *held_out]) == dataset.valid_starts().tolist()
-    segment = {name: set(np.searchsorted(dataset._last, s)) for name, s in (("train", train), ("eval", held_out))}
-    assert not segment["train"] & segment["eval"]
-    for s, before in enumerate(dataset._before):
-        assert before < 0 or (s in segment["eval"]) == (before in segment["eval"])
+    collect_long(tmp_path / "d")
+    for fraction in (0.1, 0.3, 0.5, 0.7, 0.9):
+        dataset = TransitionDataset(tmp_path / "d", eval_fraction=fraction)
+        train, held_out = (dataset.valid_starts(split=split) for split in ("train", "eval"))
+        assert sorted([*train, *held_out]) == dataset.valid_starts().tolist()
+        segment = {name: set(np.searchsorted(dataset._last, s)) for name, s in (("train", train), ("eval", held_out))}
+        assert not segment["train"] & segment["eval"]
+        for s, before in enumerate(dataset._before):
+            assert before < 0 or (s in segment["eval"]) == (before in segment["eval"])
+        n_episodes = np.count_nonzero(dataset._before < 0)
+        assert np.count_nonzero([dataset._before[s] < 0 for s in segment["eval"]]) == round(fraction * n_episodes)
     assert any(dataset._before[s] >= 0 for s in segment["eval"])
 
 
