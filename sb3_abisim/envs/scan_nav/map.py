@@ -8,6 +8,7 @@ and kept in a cache, or comes as a ``.npz`` file from elsewhere.
 import hashlib
 import json
 import os
+import sys
 import tokenize
 import warnings
 import zipfile
@@ -24,13 +25,14 @@ from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.common.vocabulary import current_scan_map
 from sb3_abisim.envs.scan_nav.build import MapSettings, map_fields
-from sb3_abisim.envs.scan_nav.files import SceneError
-from sb3_abisim.envs.scan_nav.mesh import load_mesh, warn_missing
+from sb3_abisim.envs.scan_nav.files import SceneError, warn_missing
+from sb3_abisim.envs.scan_nav.mesh import load_mesh
+from sb3_abisim.envs.scan_nav.report import plausible_report, with_walkable
 
 FORMAT = "sb3_abisim scan map 1"
 MIN_WALKABLE_AREA = 1.0  # m2
 # Hashed into the names of cached maps: raise it where the same mesh gives another map.
-_VERSION = 5
+_VERSION = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +105,14 @@ class ScanMap:
         content = [file_hash(path), path.name] if path.is_file() else None
 
         def make() -> ScanMap:
-            return cls(**map_fields(load_mesh(path, given.up), str(path), given))
+            mesh = load_mesh(path, given.up, given.meters_per_unit, given.flip_faces)
+            report = plausible_report(mesh, path, given)
+            fields = map_fields(mesh, str(path), given)
+            report = with_walkable(report, fields, path, given)
+            fields["settings"]["report"] = report.json()
+            made = cls(**fields)
+            print(report.lines(str(path)), file=sys.stderr)
+            return made
 
         return _cached(content, given, make, path.parent) if cache and content else make()
 
@@ -113,12 +122,13 @@ class ScanMap:
 
         :param seed: determines the apartment
         :param cache: whether to look in the cache, and write to it
-        :param settings: those of :class:`MapSettings`, without ``up``
+        :param settings: those of :class:`MapSettings`, but those of files
         """
         from sb3_abisim.envs.scan_nav.apartment import VERSION, apartment_mesh
 
-        if "up" in settings:
-            raise ValueError(f"an apartment stands upright, it takes no up; got {settings['up']!r}")
+        for name in ("up", "meters_per_unit", "flip_faces", "allow_implausible"):
+            if name in settings:
+                raise ValueError(f"an apartment stands upright, it takes no {name}; got {settings[name]!r}")
         given = _settings({"up": "z"} | settings)
         content = ["apartment", VERSION, seed]
 
@@ -181,7 +191,8 @@ class ScanMap:
 
 # What NumPy raises for damaged files, by where the damage is.
 _UNREADABLE = (
-    OSError, EOFError, KeyError, ValueError, IndexError, TypeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+    OSError, EOFError, KeyError, ValueError, IndexError, TypeError, RuntimeError, MemoryError, zipfile.BadZipFile,
+    zlib.error, tokenize.TokenError, SyntaxError, AttributeError, OverflowError,
 )  # fmt: skip
 
 

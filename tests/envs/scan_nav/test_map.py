@@ -105,7 +105,9 @@ def test_refuses_wrong_maps_from_elsewhere(tmp_path, changes, message):
     [
         ({"meters_per_pixel": 0}, "meters_per_pixel must be a number of meters above 0, got 0"),
         ({"floor": -1}, "floor must be"),
-        ({"up": "x"}, "up must be one of"),
+        ({"up": "w"}, "up must be one of"),
+        ({"flip_faces": "no"}, "flip_faces must be True or False, got 'no'"),
+        ({"meters_per_pixel": 30.0}, "meters_per_pixel must lie between 0.0005 and 1.0, got 30.0"),
         ({"agent_height": 3.0}, "agent_height 3.0 <= cut_height 2.0"),
         ({"color": 1}, "settings of a map are meters_per_pixel"),
     ],
