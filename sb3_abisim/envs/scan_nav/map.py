@@ -7,6 +7,7 @@ and kept in a cache, or comes as a ``.npz`` file from elsewhere.
 
 import hashlib
 import json
+import math
 import os
 import sys
 import tokenize
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.common.vocabulary import current_scan_map
-from sb3_abisim.envs.scan_nav.build import MapSettings, map_fields
+from sb3_abisim.envs.scan_nav.build import MAX_PIXELS, MapSettings, map_fields
 from sb3_abisim.envs.scan_nav.files import SceneError, warn_missing
 from sb3_abisim.envs.scan_nav.mesh import load_mesh
 from sb3_abisim.envs.scan_nav.report import plausible_report, with_walkable
@@ -72,10 +73,10 @@ class ScanMap:
                 )
         if np.isinf(self.height).any():
             raise SceneError(f"{self.source}: height is infinite somewhere; use nan where there is no surface")
-        if not (np.isfinite([self.meters_per_pixel, *self.origin]).all() and self.meters_per_pixel > 0):
+        if not (np.isfinite([self.meters_per_pixel, *self.origin]).all() and 0 < self.meters_per_pixel <= 1):
             raise SceneError(
-                f"{self.source}: meters_per_pixel {self.meters_per_pixel} must be above 0 and origin {self.origin} "
-                "finite"
+                f"{self.source}: meters_per_pixel {self.meters_per_pixel} must be above 0 and at most 1, and origin "
+                f"{self.origin} finite"
             )
         area = float(self.walkable.sum()) * self.meters_per_pixel**2
         if area < MIN_WALKABLE_AREA:
@@ -168,6 +169,7 @@ class ScanMap:
         if not path.is_file():
             raise SceneError(f"there is no scan map {path}; check the path")
         try:
+            _check_declared(path)
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
                 if str(arrays["format"]) != FORMAT:
                     raise SceneError(f"{path} has the format {str(arrays['format'])!r}, this version reads {FORMAT!r}")
@@ -194,6 +196,22 @@ _UNREADABLE = (
     OSError, EOFError, KeyError, ValueError, IndexError, TypeError, RuntimeError, MemoryError, zipfile.BadZipFile,
     zlib.error, tokenize.TokenError, SyntaxError, AttributeError, OverflowError,
 )  # fmt: skip
+
+
+def _check_declared(path: Path) -> None:
+    """Refuse a file whose arrays would be larger than any map, before one is unpacked."""
+    with zipfile.ZipFile(path) as archive:
+        for entry in (each for each in archive.infolist() if each.filename.endswith(".npy")):
+            with archive.open(entry) as member:
+                version = np.lib.format.read_magic(member)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(member)
+            n_bytes = math.prod(shape) * dtype.itemsize
+            if n_bytes > 4 * MAX_PIXELS:
+                raise SceneError(
+                    f"{path} declares {n_bytes} bytes of {entry.filename}, more than any map of {MAX_PIXELS} pixels; "
+                    "make it again with larger pixels"
+                )
 
 
 def _settings(settings: dict[str, Any]) -> MapSettings:

@@ -1,5 +1,7 @@
 """Maps as files, in the cache, and from elsewhere."""
 
+import zipfile
+
 import numpy as np
 import pytest
 import trimesh
@@ -98,6 +100,19 @@ def test_refuses_wrong_maps_from_elsewhere(tmp_path, changes, message):
         ScanMap.load(tmp_path / "map.npz")
     with pytest.raises(SceneError, match=r"no scan map .*absent"):
         ScanMap.load(tmp_path / "absent.npz")
+
+
+def member(shape, descr, data=b""):
+    header = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode() + data
+
+
+@pytest.mark.parametrize(("shape", "descr"), [((10**6, 10**6), "|u1"), ((), "<U99999999"), ((10**9, 3), "|u1")])
+def test_a_file_that_declares_more_than_a_map_is_refused_before_it_is_unpacked(tmp_path, shape, descr):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("walkable.npy", member(shape, descr, bytes(10**6)))
+    with pytest.raises(SceneError, match=r"bomb\.npz declares \d+ bytes of walkable.npy, more than any map"):
+        ScanMap.load(tmp_path / "bomb.npz")
 
 
 @pytest.mark.parametrize(
