@@ -123,10 +123,10 @@ class ScanReport:
         return (
             f"{source}: {east:.1f} x {north:.1f} x {high:.1f} m, {self.up} up{lean}, {self.n_faces} faces{left_out}, "
             f"{self.n_textures} textures\n"
-            f"  floors at {', '.join(f'{z:.2f}' for z in self.floors)} m; storey: {storey}; "
+            f"  floors at {', '.join(f'{z:z.2f}' for z in self.floors)} m; storey: {storey}; "
             f"{self.floor_area:.1f} m2 of floor{walkable}\n"
-            f"  {self.up_share:.0%} of the level faces look up; {max(self.standing, 0):.1f} m2 stand on the floor, "
-            f"{max(self.hanging, 0):.1f} m2 hang from the ceiling{unknown}; unit: {self.unit}"
+            f"  {self.up_share:.0%} of the level faces look up; {max(self.standing, 0):z.1f} m2 stand on the floor, "
+            f"{max(self.hanging, 0):z.1f} m2 hang from the ceiling{unknown}; unit: {self.unit}"
         )
 
 
