@@ -14,6 +14,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arguments import checked_arguments
+
+# Observations of all copies together take no more.
+MAX_BATCH_BYTES = 2**32
+
 
 class BatchEnv(gym.vector.VectorEnv):
     """``num_envs`` independent copies of an environment, stepped by one call.
@@ -39,6 +44,13 @@ class BatchEnv(gym.vector.VectorEnv):
     # Whether :meth:`render_factors` is there: datasets then hold the factors alone, and render observations on reading.
     renders_factors: ClassVar[bool] = False
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Arguments of every constructor are checked against its annotations."""
+        super().__init_subclass__(**kwargs)
+        if "__init__" in cls.__dict__:
+            cls.__init__ = checked_arguments(cls.__init__)  # type: ignore[method-assign]
+
+    @checked_arguments
     def __init__(
         self,
         num_envs: int,
@@ -48,8 +60,12 @@ class BatchEnv(gym.vector.VectorEnv):
         render_mode: str | None = None,
         autoreset: bool = True,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        n_bytes = sum(map(_n_bytes, (observation_space, action_space)))
+        if not 1 <= num_envs <= MAX_BATCH_BYTES // n_bytes:
+            raise ValueError(
+                f"num_envs must be at least 1, and at most {MAX_BATCH_BYTES // n_bytes} for observations and actions "
+                f"of {n_bytes} bytes, got {num_envs}"
+            )
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be at least 1 or None, got {max_episode_steps}")
         if render_mode not in (None, "rgb_array"):
@@ -277,6 +293,7 @@ class SingleEnv(gym.Env):
 
         :param action: an element of the action space
         :raises ValueError: for an action of the wrong shape, out of range, or not finite
+        :raises RuntimeError: before the first reset, or after the episode has terminated
         """
         observations, rewards, terminated, truncated, infos = self.batch.step(np.asarray(action)[None])
         info = {name: array[0].item() for name, array in infos.items() if name[0] != "_"}
@@ -317,15 +334,11 @@ def one_of(observations: Any, index: int, copy: bool = False) -> Any:
     return observations[index].copy() if copy else observations[index]
 
 
-def check_flags(**flags: Any) -> None:
-    """Refuse what is neither True nor False, such as the word "no", which would count as True.
-
-    :param flags: arguments by name
-    :raises ValueError: for the first of them
-    """
-    for name, value in flags.items():
-        if not isinstance(value, bool | np.bool_):
-            raise ValueError(f"{name} must be True or False, got {value!r}")
+def _n_bytes(space: gym.Space[Any]) -> int:
+    """Of one element."""
+    if isinstance(space, gym.spaces.Dict):
+        return sum(map(_n_bytes, space.values()))
+    return int(np.prod(space.shape or (), dtype=np.int64)) * np.dtype(space.dtype).itemsize
 
 
 def _bounds(space: gym.Space[Any]) -> tuple[Any, Any]:

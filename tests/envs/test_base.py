@@ -1,5 +1,7 @@
 """What every registered environment promises, checked over all ids."""
 
+import inspect
+import itertools
 import warnings
 
 import gymnasium as gym
@@ -9,6 +11,7 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.envs.base import batch_class as batch_class_of
 
 DISCRETE = [env_id for env_id in ENV_IDS if "Continuous" not in env_id]
 CONTINUOUS = [env_id for env_id in ENV_IDS if "Continuous" in env_id]
@@ -125,6 +128,64 @@ def test_single_environment_refuses_to_go_on_after_its_end():
     env.step(0)
     with pytest.raises(RuntimeError, match="over"):
         env.step(0)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_a_step_after_the_end_is_an_error(env_id, monkeypatch):
+    env = gym.make(env_id).unwrapped
+    env.reset(seed=0)
+    advance = env.batch._advance
+    monkeypatch.setattr(env.batch, "_advance", lambda actions: (advance(actions)[0], np.ones(1, bool)))
+    assert env.step(env.action_space.sample())[2]
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match=r"over .*: call reset\(\)"):
+            env.step(env.action_space.sample())
+    env.reset()
+    assert env.step(env.action_space.sample())[2]
+
+
+# Something of each type, and what could be mistaken for it.
+ODD = (
+    None, True, 0, 1, -1, 2.5, 1e9, float("nan"), float("inf"), 10**30, "", "no", "\0", b"x", [], [1], ["a"], (1, 2),
+    {}, {"a": 1}, {1: 2}, 1j, object(), len, int, set(), np.int8(2), np.array([1, 2]), [[1], [2, 3]],
+)  # fmt: skip
+
+
+def named(batch_class):
+    """The arguments of a batch class and of those that it is made of."""
+    constructors = [each.__dict__["__init__"] for each in batch_class.__mro__ if "__init__" in each.__dict__]
+    names = {name for each in constructors for name in inspect.signature(each).parameters}
+    return sorted(names - {"self", "args", "kwargs", "observation_space", "action_space"})
+
+
+@pytest.mark.parametrize("env_id", sorted({gym.spec(env_id).vector_entry_point: env_id for env_id in ENV_IDS}.values()))
+def test_arguments_of_a_wrong_type_are_refused_by_name(env_id):
+    """Each argument with each odd value works, or ends in a ValueError that names the argument."""
+    batch_class = batch_class_of(env_id)
+    names, n_refused = named(batch_class), 0
+    # Where the argument is right, there is no apartment of that seed.
+    others = {"scenes": -1, "goals_per_scene": 1} if "scenes" in names else {}
+    for name, value in itertools.product(names, ODD):
+        if name == "scenes" and isinstance(value, int | np.integer | list | tuple):
+            continue  # an apartment, which takes a while to make
+        if name in ("scenes", "videos") and isinstance(value, str):
+            continue  # a place that may be there
+        try:
+            batch_class(**{**others, name: value})
+        except ValueError as error:
+            n_refused += name in str(error)
+            # It may also not fit another argument, which is named then.
+            assert any(each in str(error) for each in (*names, "-1")), (name, value, error)
+    assert n_refused > 10 * len(names)
+
+
+def test_unknown_arguments_are_refused_by_name():
+    with pytest.raises(ValueError, match=r"Nav2DVectorEnv takes no argument 'size'; it takes num_envs, max_episode"):
+        gym.make("Nav2D-v0", size=3)
+    with pytest.raises(
+        ValueError, match="num_envs must be at least 1, and at most 6288385 for observations and actions"
+    ):
+        make_batch("Nav2D-v0", 10**9)
 
 
 def test_final_info_holds_the_factors_of_the_last_observation():

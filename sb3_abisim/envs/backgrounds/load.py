@@ -3,10 +3,12 @@
 import os
 from pathlib import Path
 
+from sb3_abisim.common.arguments import checked_arguments
 from sb3_abisim.envs.backgrounds.clips import SPLITS, Backgrounds
 from sb3_abisim.envs.backgrounds.photo_pan import photo_pan
 
 
+@checked_arguments
 def load_backgrounds(
     source: str | os.PathLike[str] | None = None,
     split: str = "train",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sb3_abisim.envs.backgrounds.clips import SPLITS, Backgrounds
 from sb3_abisim.envs.backgrounds.load import load_backgrounds
 from sb3_abisim.envs.backgrounds.player import N_SAMPLES, BackgroundPlayer
-from sb3_abisim.envs.base import SingleEnv, check_flags
+from sb3_abisim.envs.base import SingleEnv
 from sb3_abisim.envs.point_maze.env import PointMazeVectorEnv
 
 
@@ -64,7 +64,6 @@ class DistractorPointMazeVectorEnv(PointMazeVectorEnv):
             raise ValueError("split='clean' shows no clips; leave out videos, clips and video_kwargs")
         if videos is None and video_kwargs:
             raise ValueError(f"video_kwargs={video_kwargs} applies to custom videos only; give videos= or leave it out")
-        check_flags(color_jitter=color_jitter)
         super().__init__(num_envs, **kwargs)
         self._player: BackgroundPlayer | None = None
         if split != "clean":

@@ -8,7 +8,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from sb3_abisim.envs.base import BatchEnv, SingleEnv, check_flags
+from sb3_abisim.envs.base import BatchEnv, SingleEnv
 from sb3_abisim.envs.point_maze import top_down
 from sb3_abisim.envs.point_maze.layout import (
     GOAL_MASK,
@@ -24,6 +24,7 @@ from sb3_abisim.envs.point_maze.layout import (
 )
 from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE
 
+MAX_THREADS = 1024
 ROOM_SIZE = 15.0  # m, between the walls
 
 # The point body of gymnasium-robotics (assets/point/point.xml); a test compares the two.
@@ -157,11 +158,10 @@ class PointMazeVectorEnv(BatchEnv):
         render_mode: str | None = None,
         autoreset: bool = True,
     ) -> None:
-        check_flags(continuous=continuous, momentum=momentum)
         if reward_type not in ("step", "sparse"):
             raise ValueError(f"reward_type must be 'step' or 'sparse', got {reward_type!r}")
-        if n_threads < 1:
-            raise ValueError(f"n_threads must be at least 1, got {n_threads}")
+        if not 1 <= n_threads <= MAX_THREADS:
+            raise ValueError(f"n_threads must lie between 1 and {MAX_THREADS}, got {n_threads}")
         action_space: gym.Space[Any]
         if continuous:
             action_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arguments import checked_arguments
 from sb3_abisim.envs.backgrounds.clips import Backgrounds
 from sb3_abisim.envs.backgrounds.player import BackgroundPlayer, composite
-from sb3_abisim.envs.base import check_flags
 from sb3_abisim.envs.point_maze import top_down
 from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE, DiscPainter
 
@@ -54,6 +54,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
+    @checked_arguments
     def __init__(
         self,
         env: gym.Env[Any, Any],
@@ -69,11 +70,11 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         self._maze_env: Any = env.unwrapped
         if not hasattr(self._maze_env, "point_env") or not hasattr(self._maze_env, "maze"):
             raise ValueError(f"PointMazePixels wraps the PointMaze ids of gymnasium-robotics, got {env}")
-        check_flags(continuous=continuous, momentum=momentum, color_jitter=color_jitter)
         if frame_skip < 1:
             raise ValueError(f"frame_skip must be at least 1, got {frame_skip}")
         self.continuous = continuous
         self.frame_skip = frame_skip
+        self._over = True
         self.momentum = momentum
         self.observation_space = gym.spaces.Box(0, 255, (3, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
         if continuous:
@@ -127,6 +128,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
         # The clips sample from `np_random` here, the maze from the wrapped environment's: any clips, the same mazes.
         super().reset(seed=seed)
         _, info = self.env.reset(seed=seed, options=options)
+        self._over = False
         if self._player is not None:
             self._player.start(0, self.np_random)
         return self._observe(), info
@@ -136,8 +138,11 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
 
         :param action: an element of the action space
         :raises ValueError: for an action of the wrong shape, out of range, or not finite
+        :raises RuntimeError: before the first reset, or after the episode's end
         """
         force = self._force(action)
+        if self._over:
+            raise RuntimeError("the episode is over (or has not begun): call reset() before step()")
         if not self.momentum:
             point_env = self._maze_env.point_env
             point_env.set_state(point_env.data.qpos, np.zeros(2))
@@ -150,6 +155,7 @@ class PointMazePixels(gym.Env[NDArray[np.uint8], Any]):
                 break
         if self._player is not None:
             self._player.advance()
+        self._over = bool(terminated or truncated)
         return self._observe(), total, terminated, truncated, {**info, "is_success": success}
 
     def _force(self, action: Any) -> NDArray[np.float32]:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sb3_abisim.envs.scan_nav.furniture import ROOMS, Piece, Solid
-from sb3_abisim.envs.scan_nav.mesh import ScanMesh, Surface
+from sb3_abisim.envs.scan_nav.mesh import ScanMesh
+from sb3_abisim.envs.scan_nav.surfaces import Surface
 from sb3_abisim.envs.scan_nav.textures import FLOOR_PIXELS, TEXTURE_SIZE, TEXTURES, planks, rug, texture, tiles
 
 # Hashed into the names of cached maps: raise it where the same seed gives another apartment.

@@ -7,10 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.envs.scan_nav.files import SceneError
-from sb3_abisim.envs.scan_nav.mesh import LEVEL_BIN, ScanMesh, level_areas
-from sb3_abisim.envs.scan_nav.raster import Nearest, contour_pixels, fragments, shade
+from sb3_abisim.envs.scan_nav.mesh import ScanMesh
+from sb3_abisim.envs.scan_nav.raster import Nearest, shade, solid_contour_pixels, solid_fragments
+from sb3_abisim.envs.scan_nav.surfaces import Surface
+from sb3_abisim.envs.scan_nav.upright import LEVEL_BIN, UP_AXES, level_areas
 
 MAX_PIXELS = 64_000_000
+_PIXELS_AT_A_TIME = 2_000_000
+MIN_METERS_PER_PIXEL, MAX_METERS_PER_PIXEL = 0.0005, 1.0
+# Pixels that the faces may cover in all, each face for itself: as many layers of the map, and these in any case.
+MAX_LAYERS, FREE_FRAGMENTS, MAX_FRAGMENTS = 200, 100_000_000, 3_000_000_000
 # A level is a floor if it has this share of the largest level's area, and floors are this far apart.
 FLOOR_SHARE = 0.25
 FLOOR_DISTANCE = 1.5  # m
@@ -25,12 +31,15 @@ class MapSettings:
     """How a mesh becomes a map; Habitat's numbers where Habitat has some.
 
     :param meters_per_pixel: of the map
-    :param up: the file's upward axis, "y", "z" or "auto"
+    :param up: the file's upward axis, "x", "y", "z", one of these with a minus, or "auto", which takes "y" or "z"
     :param floor: which storey, 0 being the lowest
     :param cut_height: what hangs higher than this above the floor is taken away, in m
     :param agent_radius: distance that the agent's center keeps from obstacles, in m
     :param agent_height: what is higher than this does not stop it, in m
     :param max_climb: what is lower than this does not stop it, in m
+    :param meters_per_unit: the file's unit, 1 for meters
+    :param flip_faces: whether the file's faces show their backs
+    :param allow_implausible: whether a scan is taken that looks upside down, inside out or of another unit
     """
 
     meters_per_pixel: float = 0.02
@@ -40,14 +49,27 @@ class MapSettings:
     agent_radius: float = 0.1
     agent_height: float = 1.5
     max_climb: float = 0.2
+    meters_per_unit: float = 1.0
+    flip_faces: bool = False
+    allow_implausible: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("meters_per_pixel", "cut_height", "agent_radius", "agent_height", "max_climb"):
+        for name in ("meters_per_pixel", "cut_height", "agent_radius", "agent_height", "max_climb", "meters_per_unit"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1000:
                 raise ValueError(f"{name} must be a number of meters above 0, got {value!r}")
+        if not MIN_METERS_PER_PIXEL <= self.meters_per_pixel <= MAX_METERS_PER_PIXEL:
+            raise ValueError(
+                f"meters_per_pixel must lie between {MIN_METERS_PER_PIXEL} and {MAX_METERS_PER_PIXEL}, got "
+                f"{self.meters_per_pixel!r}"
+            )
         if isinstance(self.floor, bool) or not isinstance(self.floor, int) or self.floor < 0:
             raise ValueError(f"floor must be a whole number of at least 0, got {self.floor!r}")
+        if self.up not in UP_AXES:
+            raise ValueError(f"up must be one of {', '.join(UP_AXES)}, got {self.up!r}")
+        for name in ("flip_faces", "allow_implausible"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
         if not self.max_climb < self.agent_height <= self.cut_height:
             raise ValueError(
                 f"max_climb {self.max_climb} < agent_height {self.agent_height} <= cut_height {self.cut_height} must "
@@ -119,12 +141,14 @@ def map_fields(mesh: ScanMesh, source: str, settings: MapSettings) -> dict[str, 
     grid = (corners - (west, top, base)) / (scale, -scale, 1)
     faces_up = _turn(grid) < 0
     others = np.array([z - base for k, z in enumerate(floors) if k != settings.floor])
-    seen = _look(grid, faces_up, height, width, settings, others)
+    _check_layers(source, grid, width * height)
+    seen = _look(grid, mesh.surfaces, faces_up, height, width, settings, others)
     shown, face, inside = seen["height"], seen["face"], seen["inside"]
     pixels = np.flatnonzero(face >= 0)
     orthophoto = np.zeros((height * width, 3), dtype=np.uint8)
-    rows, columns = np.divmod(pixels, width)
-    orthophoto[pixels] = shade(grid, mesh.surfaces, face[pixels], columns + 0.5, rows + 0.5)
+    for part in np.array_split(pixels, 1 + len(pixels) // _PIXELS_AT_A_TIME):
+        rows, columns = np.divmod(part, width)
+        orthophoto[part] = shade(grid, mesh.surfaces, face[part], columns + 0.5, rows + 0.5)
     walkable = _walkable(
         seen["floor"].reshape(height, width), (seen["obstacle"] | inside).reshape(height, width), settings
     )
@@ -139,8 +163,21 @@ def map_fields(mesh: ScanMesh, source: str, settings: MapSettings) -> dict[str, 
     }
 
 
+def _check_layers(source: str, grid: NDArray[np.float64], n_pixels: int) -> None:
+    """Refuse what would take hours: faces that lie on top of one another hundreds of times."""
+    size = np.ptp(grid, axis=1)
+    covered = float((abs(_turn(grid)) / 2).sum() + 2 * len(range(15)) * size[:, :2].max(axis=1).sum())
+    granted = min(MAX_FRAGMENTS, max(MAX_LAYERS * n_pixels, FREE_FRAGMENTS))
+    if covered > granted:
+        raise SceneError(
+            f"{source}: its faces cover {covered:.3g} pixels in all, more than {granted:.3g}, of a map of {n_pixels}; "
+            "raise meters_per_pixel, or decimate the scan"
+        )
+
+
 def _look(
     grid: NDArray[np.float64],
+    surfaces: tuple[Surface, ...],
     faces_up: NDArray[np.bool_],
     height: int,
     width: int,
@@ -151,7 +188,7 @@ def _look(
     n = height * width
     below, top, ceiling = Nearest(n, highest=True), Nearest(n), Nearest(n)
     floor, obstacle = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
-    for face, pixel, z in fragments(grid, height, width):
+    for face, pixel, z in solid_fragments(grid, surfaces, height, width):
         up, high = faces_up[face], z > settings.cut_height
         obstacle[pixel[(z > settings.max_climb) & (z < settings.agent_height)]] = True
         floor[pixel[up & (abs(z) <= settings.max_climb)]] = True
@@ -163,7 +200,9 @@ def _look(
         top.add(face[topmost], pixel[topmost], z[topmost])
         ceiling.add(face[capped], pixel[capped], z[capped])
     for level in np.arange(settings.max_climb, settings.agent_height, SLICE_DISTANCE):
-        obstacle[contour_pixels(grid, level + 1e-4, height, width)] = True
+        if level > grid[..., 2].max():
+            break
+        obstacle[solid_contour_pixels(grid, surfaces, level + 1e-4, height, width)] = True
     # A sheet with two sides, such as a thin ceiling, is no solid: the tolerance keeps its upper side from winning.
     inside = top.height < ceiling.height - 1e-3
     return {
@@ -181,12 +220,30 @@ def _walkable(floor: NDArray[np.bool_], obstacle: NDArray[np.bool_], settings: M
 
     size = max(1, round(PINHOLE / settings.meters_per_pixel))
     closed = ndimage.binary_closing(np.pad(floor, size), np.ones((size, size)))[size:-size, size:-size]
-    free = np.pad((floor | closed) & ~obstacle, 1)
-    distance = ndimage.distance_transform_edt(free)[1:-1, 1:-1] * settings.meters_per_pixel
-    islands, n_islands = ndimage.label(distance > settings.agent_radius)
+    free = (floor | closed) & ~obstacle
+    islands, n_islands = ndimage.label(_far_enough(free, settings))
     if n_islands == 0:
         return np.zeros_like(floor)
-    sizes = np.bincount(islands.ravel())
+    rows = max(1, _PIXELS_AT_A_TIME // free.shape[1])
+    sizes = np.zeros(n_islands + 1, dtype=np.int64)
+    for row in range(0, len(islands), rows):
+        sizes += np.bincount(islands[row : row + rows].ravel(), minlength=n_islands + 1)
     sizes[0] = 0
     walkable: NDArray[np.bool_] = islands == sizes.argmax()
     return walkable
+
+
+def _far_enough(free: NDArray[np.bool_], settings: MapSettings) -> NDArray[np.bool_]:
+    """Where the nearest pixel that is not free is further away than the agent's radius."""
+    from scipy import ndimage
+
+    far = np.zeros_like(free)
+    margin = int(settings.agent_radius / settings.meters_per_pixel) + 1
+    rows = max(1, _PIXELS_AT_A_TIME // free.shape[1])
+    for row in range(0, len(free), rows):
+        # In strips that overlap by more than the radius: distances take fifty bytes a pixel.
+        first, last = max(row - margin, 0), min(row + rows + margin, len(free))
+        distance = ndimage.distance_transform_edt(np.pad(free[first:last], 1))[1:-1, 1:-1]
+        near = distance * settings.meters_per_pixel > settings.agent_radius
+        far[row : row + rows] = near[row - first : row - first + rows]
+    return far

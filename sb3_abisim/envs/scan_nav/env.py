@@ -10,12 +10,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.envs.base import BatchEnv, SingleEnv, check_flags
+from sb3_abisim.envs.base import BatchEnv, SingleEnv
 from sb3_abisim.envs.point_maze.top_down import enlarge
 from sb3_abisim.envs.scan_nav.map import ScanMap
 from sb3_abisim.envs.scan_nav.view import MARKER_RADIUS, MARKERS, MarkerPainter, SceneView
 from sb3_abisim.envs.scan_nav.world import NODE, ScanWorld, StartRule
 
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 2048
 OBS_MODES = ("rgbd", "dict", "rgb")
 ACTIONS = ("stop", "move_forward", "turn_left", "turn_right")
 _OPTIONS = ("scene", "goal", "start", "heading")
@@ -101,13 +102,14 @@ class ScanNavVectorEnv(BatchEnv):
         min_ratio: float | None = None,
         goals_per_scene: int = 256,
     ) -> None:
-        check_flags(allow_sliding=allow_sliding)
         _check_choice("obs_mode", obs_mode, OBS_MODES)
         _check_choice("marker", marker, tuple(MARKERS))
         _check_choice("stop", stop, ("action", "auto"))
-        if isinstance(image_size, bool) or not isinstance(image_size, int) or image_size < 32 or image_size % 2:
-            raise ValueError(f"image_size must be an even number of at least 32, got {image_size!r}")
-        if isinstance(goals_per_scene, bool) or not isinstance(goals_per_scene, int) or goals_per_scene < 1:
+        if not MIN_IMAGE_SIZE <= image_size <= MAX_IMAGE_SIZE or image_size % 2:
+            raise ValueError(
+                f"image_size must be an even number from {MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}, got {image_size!r}"
+            )
+        if goals_per_scene < 1:
             raise ValueError(f"goals_per_scene must be a whole number of at least 1, got {goals_per_scene!r}")
         for name, value, low, high in (
             ("view_size", view_size, 2.0, 100.0),
@@ -116,6 +118,8 @@ class ScanNavVectorEnv(BatchEnv):
             ("success_distance", success_distance, 0.01, 10.0),
             ("min_geodesic", min_geodesic, success_distance, 1000.0),
             ("max_geodesic", max_geodesic, min_geodesic, 1000.0),
+            ("slack_reward", slack_reward, -1e6, 1e6),
+            ("success_reward", success_reward, -1e6, 1e6),
             ("min_ratio", 1.0 if min_ratio is None else min_ratio, 1.0, 10.0),
         ):
             if not low <= value <= high:
@@ -165,9 +169,9 @@ class ScanNavVectorEnv(BatchEnv):
         if isinstance(scene, bool) or not isinstance(scene, int | np.integer) or not 0 <= scene < len(self.scans):
             raise ValueError(f"the option scene must be an index of {len(self.scans)} scenes, got {scene!r}")
         for name in ("goal", "start"):
-            if name in options and (np.shape(options[name]) != (2,) or not np.isfinite(options[name]).all()):
+            if name in options and not _are_numbers(options[name], 2):
                 raise ValueError(f"the option {name} must be (x, y) in meters, got {options[name]!r}")
-        if not np.isfinite(options.get("heading", 0.0)):
+        if not _are_numbers([options.get("heading", 0.0)], 1):
             raise ValueError(f"the option heading must be a number of degrees, got {options['heading']!r}")
         # A goal without a scene is in the first one.
         self._options = {"scene": 0, **options} if "goal" in options else dict(options)
@@ -377,6 +381,14 @@ def _as_list(scenes: Any) -> list[Any]:
             raise ValueError("scenes is empty; give at least one, or None for the five apartments")
         return list(scenes)
     return [scenes]
+
+
+def _are_numbers(values: Any, n: int) -> bool:
+    try:
+        array = np.asarray(values)
+    except ValueError:  # lists of several lengths
+        return False
+    return array.shape == (n,) and array.dtype.kind in "iuf" and bool(np.isfinite(array).all())
 
 
 def _check_choice(name: str, value: Any, known: tuple[str, ...]) -> None:

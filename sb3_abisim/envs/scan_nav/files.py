@@ -1,36 +1,87 @@
-"""What scan files declare, before and beside what trimesh makes of them."""
+"""A scan's file, the files beside it, and what all of them together may ask of memory."""
 
-import json
+import os
 import re
-import struct
-from collections.abc import Callable
+import warnings
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
+from sb3_abisim.common.files import file_hash
+
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
-_UNSUPPORTED = {
-    "KHR_draco_mesh_compression": "Draco compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
-    "EXT_meshopt_compression": "meshopt compression (undo it: `npx @gltf-transform/cli copy IN OUT`)",
-    "KHR_texture_basisu": "KTX2 textures (convert them: `npx @gltf-transform/cli ktxdecompress IN OUT`)",
-    "KHR_mesh_quantization": "quantized vertices (undo it: `npx @gltf-transform/cli dequantize IN OUT`)",
-}
-# Extensions that a file may require and that change nothing seen from above, or that trimesh knows.
-_HARMLESS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-_FLOAT = 5126  # glTF's component type
-_TRIANGLES = (4, 5)  # glTF's modes that trimesh reads
-_UNMOVED = {"offset": [0, 0], "rotation": 0, "scale": [1, 1]}
+# What a scan may declare; it is counted before anything of that size is allocated.
+MAX_FILE_BYTES = 2 * 2**30
+MAX_FACES = 8_000_000
+MAX_VERTICES = 24_000_000
+MAX_INSTANCES = 100_000
+MAX_IMAGE_SIDE = 8192
+MAX_IMAGE_PIXELS = 512_000_000  # of all textures together
+# A few bytes can declare an image of any size; these many pixels are granted in any case, and then so many per byte.
+FREE_IMAGE_PIXELS = 68_000_000
+IMAGE_PIXELS_PER_BYTE = 50
+_MAX_STEPS = 32  # folders of a path that are looked for
 
 
 class SceneError(ValueError):
     """A scan that cannot be used; the message names the file and the remedy."""
 
 
-def check_file(path: Path) -> Any:
+class Budget:
+    """What a scan has declared so far.
+
+    :param path: of the scan, for messages
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._counts = {"faces": 0, "vertices": 0, "instances": 0}
+        self._pixels = self._image_bytes = 0
+
+    def add(self, what: str, number: int) -> None:
+        """Count what is about to be read.
+
+        :param what: "faces", "vertices" or "instances"
+        :param number: of them
+        :raises SceneError: for more than the limit
+        """
+        self._counts[what] += number
+        limit = {"faces": MAX_FACES, "vertices": MAX_VERTICES, "instances": MAX_INSTANCES}[what]
+        if self._counts[what] > limit:
+            raise SceneError(
+                f"{self._path} declares {self._counts[what]} {what}, more than {limit}; decimate the scan, or cut it "
+                "into several"
+            )
+
+    def add_image(self, name: str, width: int, height: int, n_bytes: int) -> None:
+        """Count a texture before it is decoded.
+
+        :param name: of the texture
+        :param width: in pixels, as its header says
+        :param height: in pixels, as its header says
+        :param n_bytes: of its file
+        :raises SceneError: for one that is too large, or too many
+        """
+        if max(width, height) > MAX_IMAGE_SIDE:
+            raise SceneError(f"{self._path}: the texture {name} has {width} x {height} pixels; {REEXPORT}")
+        self._pixels += width * height
+        self._image_bytes += n_bytes
+        granted = min(MAX_IMAGE_PIXELS, FREE_IMAGE_PIXELS + IMAGE_PIXELS_PER_BYTE * self._image_bytes)
+        if self._pixels > granted:
+            raise SceneError(
+                f"{self._path}: its textures declare {self._pixels} pixels in {self._image_bytes} bytes, more than "
+                f"{granted}; export it again with smaller textures"
+            )
+
+
+# Pillow refuses far larger ones.
+REEXPORT = f"export it again with PNG or JPEG textures of at most {MAX_IMAGE_SIDE} x {MAX_IMAGE_SIDE} pixels"
+
+
+def check_file(path: Path) -> None:
     """Refuse what is visibly wrong without reading all of it.
 
     :param path: of the scan
-    :return: a glTF file's JSON part, else {}
     :raises SceneError: for what is wrong
     """
     if path.suffix.lower() not in SUFFIXES:
@@ -43,106 +94,116 @@ def check_file(path: Path) -> Any:
         raise SceneError(f"{path} is empty; download or copy it again")
     if head.startswith(b"version https://git-lfs"):
         raise SceneError(f"{path} is a Git LFS pointer, not the scan itself; run `git lfs pull` in its repository")
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        return {}
-    try:
-        header = _glb_header(path, head) if path.suffix.lower() == ".glb" else json.loads(path.read_bytes())
-        _check_extensions(path, header)
-    except SceneError:
-        raise
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise SceneError(f"{path} cannot be read ({error}); download or export it again") from error
-    return header
+    if (size := path.stat().st_size) > MAX_FILE_BYTES:
+        raise SceneError(
+            f"{path} has {size} bytes, more than {MAX_FILE_BYTES}; decimate the scan, or cut it into several"
+        )
 
 
-def _glb_header(path: Path, head: bytes) -> Any:
-    if len(head) < 20 or head[:4] != b"glTF":
-        raise SceneError(f"{path} is not a binary glTF file; download it again, or give it the suffix of its format")
-    total, n_json = struct.unpack("<I", head[8:12])[0], struct.unpack("<I", head[12:16])[0]
-    if path.stat().st_size < total:
-        raise SceneError(f"{path} is truncated: it has {path.stat().st_size} of {total} bytes; download it again")
-    with open(path, "rb") as file:
-        file.seek(20)
-        return json.loads(file.read(n_json))
+class ScanFiles:
+    """The files in a scan's folder that it refers to. Nothing outside of the folder is read.
 
-
-def _check_extensions(path: Path, header: dict[str, Any]) -> None:
-    """Refuse what trimesh passes over and would show as something else."""
-    for name in header.get("extensionsRequired", []):
-        if name in _UNSUPPORTED:
-            raise SceneError(f"{path} uses {_UNSUPPORTED[name]}, which is not supported")
-        if not name.startswith(_HARMLESS):
-            raise SceneError(f"{path} needs the glTF extension {name}, which is not supported; export it without")
-    for primitive, texture in primitives(header):
-        names = {"POSITION", "TEXCOORD_0"} if texture else {"POSITION"}
-        read = [header["accessors"][index] for name, index in primitive["attributes"].items() if name in names]
-        if any(accessor["componentType"] != _FLOAT for accessor in read):
-            raise SceneError(f"{path} uses {_UNSUPPORTED['KHR_mesh_quantization']}, which is not supported")
-        moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
-        chosen = moved.get("texCoord", texture.get("texCoord", 0))
-        if chosen or any(moved.get(k, v) != v for k, v in _UNMOVED.items()):
-            raise SceneError(
-                f"{path} has a color texture in a second set of coordinates, or moved or repeated by "
-                "KHR_texture_transform, which is not supported; bake the texture (in Blender) and export it again"
-            )
-
-
-def primitives(header: dict[str, Any]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    """A glTF file's runs of triangles, each with its material's reference to a color texture, or {}.
-
-    :param header: its JSON part
+    :param path: of the scan
     """
-    found = []
-    for primitive in (p for mesh in header.get("meshes", []) for p in mesh["primitives"]):
-        if primitive.get("mode", 4) in _TRIANGLES:
-            material = header["materials"][primitive["material"]] if "material" in primitive else {}
-            found.append((primitive, _color_texture(material)))
-    return found
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.folder = path.parent
+        # What was read: path relative to the folder, to its sha256, or to "" for a place where nothing was found.
+        self.hashes = {path.name: file_hash(path)}
+        self.missing: list[str] = []
 
-def _color_texture(material: dict[str, Any]) -> dict[str, Any]:
-    """A glTF material's reference to a color texture, or {}."""
-    glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    metallic = material.get("pbrMetallicRoughness", {})
-    reference: dict[str, Any] = glossy.get("diffuseTexture") or metallic.get("baseColorTexture") or {}
-    return reference
+    def find(self, name: str, beside: str = "") -> str | None:
+        """Where a file lies, whatever program and machine has written its name.
 
+        Exporters write a space as %20, backslashes, other letters' case, and folders of another machine: of those, the
+        longest end of the path that is there counts.
 
-def texture_uri(header: dict[str, Any], reference: dict[str, Any]) -> str | None:
-    """Where the image of a glTF texture lies.
-
-    :param header: a file's JSON part
-    :param reference: to a texture, or {}
-    :return: None for within the file, or where the file contradicts itself
-    """
-    try:
-        texture = header["textures"][reference["index"]]
-        others = [extension["source"] for extension in texture.get("extensions", {}).values() if "source" in extension]
-        uri: str | None = header["images"][[*others, texture.get("source")][0]].get("uri")
-    except (LookupError, TypeError):
+        :param name: as the scan gives it
+        :param beside: folder of the file that gives it, relative to the scan's
+        :return: relative to the scan's folder, or None; what was looked for is noted, and that it was not there
+        :raises SceneError: where several files differ by the case of their letters alone
+        """
+        looked_for = []
+        for text in dict.fromkeys((name.strip(), unquote(name.strip()))):
+            steps = _without_dots([step for step in re.split(r"[/\\]", text) if step])[-_MAX_STEPS:]
+            for end in ("/".join(steps[k:]) for k in range(len(steps))):
+                looked_for += [f"{beside}/{end}", end] if beside else [end]
+        for candidate in dict.fromkeys(looked_for):
+            if (found := self._there(candidate)) is not None:
+                return found
+        # Wherever it appears, it is noticed.
+        self.hashes.update(dict.fromkeys((each for each in looked_for if len(each) < 1000), ""))
+        self.missing.append(name)
         return None
-    return uri
+
+    def read(self, found: str) -> bytes:
+        """The content of a file.
+
+        :param found: by :meth:`find`
+        """
+        file = self.folder / found
+        if file.stat().st_size > MAX_FILE_BYTES:
+            raise SceneError(f"{self.path}: {found} has more than {MAX_FILE_BYTES} bytes; decimate the scan")
+        self.hashes[found] = file_hash(file)
+        return file.read_bytes()
+
+    def _there(self, candidate: str) -> str | None:
+        root = self.folder.resolve()
+        try:
+            if not (root / candidate).resolve().is_relative_to(root):
+                return None
+            if (self.folder / candidate).is_file():
+                return candidate
+            place, found = self.folder, []
+            for step in candidate.split("/"):
+                same = [e for e in os.listdir(place) if e.lower() == step.lower()] if place.is_dir() else []
+                if len(same) > 1 and step not in same:
+                    raise SceneError(
+                        f"{self.path} refers to {candidate}, and {', '.join(sorted(same))} differ by the case of "
+                        "letters alone; rename one"
+                    )
+                if not same:
+                    return None
+                found.append(step if step in same else same[0])
+                place = place / found[-1]
+            inside = place.resolve().is_relative_to(root)
+        except SceneError:
+            raise
+        except (OSError, ValueError):  # a name that is none, such as one with a null character or a too long one
+            return None
+        return "/".join(found) if inside and place.is_file() else None
+
+    def warn_missing(self) -> None:
+        """Warn which files are not there, if any."""
+        warn_missing(self.path, self.missing, stacklevel=6)
 
 
-def lost_materials(kind: str, header: Any, libraries: list[bytes], missing: list[str]) -> Callable[[Any], bool]:
-    """Whether a material shows no texture because the file of its texture is not there.
+def _without_dots(steps: list[str]) -> list[str]:
+    """A path without "." and "..": what leads out of the folder is dropped."""
+    kept: list[str] = []
+    for step in steps:
+        if step == "..":
+            kept = kept[:-1]
+        elif step != ".":
+            kept.append(step)
+    return kept
 
-    :param kind: suffix of the scan, without its dot
-    :param header: a glTF file's JSON part, else {}
-    :param libraries: the contents of an OBJ file's material libraries
-    :param missing: names of files that are not there, as the scan gives them
-    :return: a function of trimesh's material
+
+def warn_missing(source: str | os.PathLike[str], names: Iterable[str], stacklevel: int = 4) -> None:
+    """Warn which files of a scan are not there, if any.
+
+    :param source: the scan
+    :param names: of the files that it refers to
+    :param stacklevel: of the warning
     """
-    if not missing or kind == "ply" or any(name.lower().endswith(".mtl") for name in missing):
-        return lambda material: bool(missing)
-    names = {m.get("name") for m in header.get("materials", []) if texture_uri(header, _color_texture(m)) in missing}
-    for line in b"\n".join(libraries).decode(errors="replace").splitlines():
-        key, _, value = line.strip().partition(" ")
-        if key.lower() == "newmtl":
-            current = " ".join(value.split())
-        elif key.lower() == "map_kd" and value.strip() in missing:
-            names.add(current)
-    return lambda material: material.name in names
+    # One file may have been looked for in several places.
+    if missing := sorted(set(map(bare_name, names))):
+        warnings.warn(
+            f"{source} refers to {', '.join(missing)}, which is not there (in the scan's folder); what it covers gets "
+            "a plain color",
+            stacklevel=stacklevel,
+        )
 
 
 def bare_name(name: str) -> str:

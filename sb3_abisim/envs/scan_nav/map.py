@@ -7,7 +7,9 @@ and kept in a cache, or comes as a ``.npz`` file from elsewhere.
 
 import hashlib
 import json
+import math
 import os
+import sys
 import tokenize
 import warnings
 import zipfile
@@ -23,14 +25,15 @@ from numpy.typing import NDArray
 from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.common.vocabulary import current_scan_map
-from sb3_abisim.envs.scan_nav.build import MapSettings, map_fields
-from sb3_abisim.envs.scan_nav.files import SceneError
-from sb3_abisim.envs.scan_nav.mesh import load_mesh, warn_missing
+from sb3_abisim.envs.scan_nav.build import MAX_PIXELS, MapSettings, map_fields
+from sb3_abisim.envs.scan_nav.files import SceneError, warn_missing
+from sb3_abisim.envs.scan_nav.mesh import load_mesh
+from sb3_abisim.envs.scan_nav.report import plausible_report, with_walkable
 
 FORMAT = "sb3_abisim scan map 1"
 MIN_WALKABLE_AREA = 1.0  # m2
 # Hashed into the names of cached maps: raise it where the same mesh gives another map.
-_VERSION = 5
+_VERSION = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +73,10 @@ class ScanMap:
                 )
         if np.isinf(self.height).any():
             raise SceneError(f"{self.source}: height is infinite somewhere; use nan where there is no surface")
-        if not (np.isfinite([self.meters_per_pixel, *self.origin]).all() and self.meters_per_pixel > 0):
+        if not (np.isfinite([self.meters_per_pixel, *self.origin]).all() and 0 < self.meters_per_pixel <= 1):
             raise SceneError(
-                f"{self.source}: meters_per_pixel {self.meters_per_pixel} must be above 0 and origin {self.origin} "
-                "finite"
+                f"{self.source}: meters_per_pixel {self.meters_per_pixel} must be above 0 and at most 1, and origin "
+                f"{self.origin} finite"
             )
         area = float(self.walkable.sum()) * self.meters_per_pixel**2
         if area < MIN_WALKABLE_AREA:
@@ -103,7 +106,14 @@ class ScanMap:
         content = [file_hash(path), path.name] if path.is_file() else None
 
         def make() -> ScanMap:
-            return cls(**map_fields(load_mesh(path, given.up), str(path), given))
+            mesh = load_mesh(path, given.up, given.meters_per_unit, given.flip_faces)
+            report = plausible_report(mesh, path, given)
+            fields = map_fields(mesh, str(path), given)
+            report = with_walkable(report, fields, path, given)
+            fields["settings"]["report"] = report.json()
+            made = cls(**fields)
+            print(report.lines(str(path)), file=sys.stderr)
+            return made
 
         return _cached(content, given, make, path.parent) if cache and content else make()
 
@@ -113,12 +123,13 @@ class ScanMap:
 
         :param seed: determines the apartment
         :param cache: whether to look in the cache, and write to it
-        :param settings: those of :class:`MapSettings`, without ``up``
+        :param settings: those of :class:`MapSettings`, but those of files
         """
         from sb3_abisim.envs.scan_nav.apartment import VERSION, apartment_mesh
 
-        if "up" in settings:
-            raise ValueError(f"an apartment stands upright, it takes no up; got {settings['up']!r}")
+        for name in ("up", "meters_per_unit", "flip_faces", "allow_implausible"):
+            if name in settings:
+                raise ValueError(f"an apartment stands upright, it takes no {name}; got {settings[name]!r}")
         given = _settings({"up": "z"} | settings)
         content = ["apartment", VERSION, seed]
 
@@ -158,6 +169,7 @@ class ScanMap:
         if not path.is_file():
             raise SceneError(f"there is no scan map {path}; check the path")
         try:
+            _check_declared(path)
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
                 if str(arrays["format"]) != FORMAT:
                     raise SceneError(f"{path} has the format {str(arrays['format'])!r}, this version reads {FORMAT!r}")
@@ -181,8 +193,25 @@ class ScanMap:
 
 # What NumPy raises for damaged files, by where the damage is.
 _UNREADABLE = (
-    OSError, EOFError, KeyError, ValueError, IndexError, TypeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+    OSError, EOFError, KeyError, ValueError, IndexError, TypeError, RuntimeError, MemoryError, zipfile.BadZipFile,
+    zlib.error, tokenize.TokenError, SyntaxError, AttributeError, OverflowError,
 )  # fmt: skip
+
+
+def _check_declared(path: Path) -> None:
+    """Refuse a file whose arrays would be larger than any map, before one is unpacked."""
+    with zipfile.ZipFile(path) as archive:
+        for entry in (each for each in archive.infolist() if each.filename.endswith(".npy")):
+            with archive.open(entry) as member:
+                version = np.lib.format.read_magic(member)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(member)
+            n_bytes = math.prod(shape) * dtype.itemsize
+            if n_bytes > 4 * MAX_PIXELS:
+                raise SceneError(
+                    f"{path} declares {n_bytes} bytes of {entry.filename}, more than any map of {MAX_PIXELS} pixels; "
+                    "make it again with larger pixels"
+                )
 
 
 def _settings(settings: dict[str, Any]) -> MapSettings:

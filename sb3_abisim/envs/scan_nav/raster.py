@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.envs.scan_nav.mesh import Surface
+from sb3_abisim.envs.scan_nav.surfaces import Surface, colors_at, see_through, solid_at
 
 # Rows of triangles, and pixels, that are worked on at a time: bounds memory.
 _CHUNK = 1_000_000
@@ -116,35 +116,26 @@ def shade(
     :param y: second coordinate of each point
     :return: (n, 3), RGB
     """
+    return colors_at(surfaces, face, corner_weights(corners, face, x, y))
+
+
+def corner_weights(
+    corners: NDArray[np.float64], face: NDArray[np.int64], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How much each corner of a triangle counts at a point on it, (n, 3).
+
+    :param corners: of all triangles, (m, 3, 3); only the first two coordinates are read
+    :param face: triangle of each point, (n,)
+    :param x: first coordinate of each point
+    :param y: second coordinate of each point
+    """
     a, b, c = corners[face, 0, :2], corners[face, 1, :2], corners[face, 2, :2]
     ab, ac, ap = b - a, c - a, np.stack([x, y], axis=1) - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     beta = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
     gamma = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
-    weights = np.clip(np.stack([1 - beta - gamma, beta, gamma], axis=1), 0, 1)
-    colors = np.zeros((len(face), 3), dtype=np.uint8)
-    ends = np.cumsum([surface.n_faces for surface in surfaces])
-    owner = np.searchsorted(ends, face, side="right")
-    for k in np.unique(owner):
-        surface, mine = surfaces[k], np.flatnonzero(owner == k)
-        corner_values = surface.coordinates[face[mine] - (ends[k] - surface.n_faces)]
-        values = np.einsum("nk,nkd->nd", weights[mine], corner_values)
-        rgb = values if surface.texture is None else _sample(surface.texture, values)
-        colors[mine] = np.rint(np.clip(rgb, 0, 255)).astype(np.uint8)
-    return colors
-
-
-def _sample(texture: NDArray[np.uint8], uv: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bilinear interpolation; the texture repeats."""
-    height, width = texture.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    right, down = (x - left)[:, None], (y - top)[:, None]
-    columns, rows = (left % width, (left + 1) % width), (top % height, (top + 1) % height)
-    upper = texture[rows[0], columns[0]] * (1 - right) + texture[rows[0], columns[1]] * right
-    lower = texture[rows[1], columns[0]] * (1 - right) + texture[rows[1], columns[1]] * right
-    mixed: NDArray[np.float64] = upper * (1 - down) + lower * down
-    return mixed
+    weights: NDArray[np.float64] = np.clip(np.stack([1 - beta - gamma, beta, gamma], axis=1), 0, 1)
+    return weights
 
 
 def contour_pixels(corners: NDArray[np.float64], level: float, height: int, width: int) -> NDArray[np.int64]:
@@ -156,19 +147,75 @@ def contour_pixels(corners: NDArray[np.float64], level: float, height: int, widt
     :param width: of the grid, in pixels
     :return: pixels as row * width + column, some of them several times
     """
+    cells = [rows * width + columns for _, columns, rows, _ in _contour(corners[..., :3], level, height, width)]
+    return np.concatenate(cells) if cells else np.zeros(0, dtype=np.int64)
+
+
+def solid_contour_pixels(
+    corners: NDArray[np.float64], surfaces: tuple[Surface, ...], level: float, height: int, width: int
+) -> NDArray[np.int64]:
+    """As :func:`contour_pixels`, without those of faces that one sees through there.
+
+    :param corners: as for :func:`fragments`
+    :param surfaces: the triangles' coloring, in their order
+    :param level: height of the plane
+    :param height: of the grid, in pixels
+    :param width: of the grid, in pixels
+    """
+    clear = see_through(surfaces)
+    if not clear.any():
+        return contour_pixels(corners, level, height, width)
+    cells = [contour_pixels(corners[~clear], level, height, width)]
+    faces = np.flatnonzero(clear)
+    # The corners' weights are carried along like coordinates.
+    weighted = np.concatenate([corners[faces], np.broadcast_to(np.eye(3), (len(faces), 3, 3))], axis=2)
+    for face, columns, rows, weights in _contour(weighted, level, height, width):
+        solid = solid_at(surfaces, faces[face], weights)
+        cells.append((rows * width + columns)[solid])
+    return np.concatenate(cells)
+
+
+def _contour(
+    corners: NDArray[np.float64], level: float, height: int, width: int
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
+    """Face, column and row of points on the cut, and what the corners carry behind their three coordinates there."""
     above = corners[..., 2] > level
-    tri = corners[above.any(axis=1) & ~above.all(axis=1)]
+    cut = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
+    tri = corners[cut]
     after = np.roll(tri, -1, axis=1)
     crosses = (tri[..., 2] > level) != (after[..., 2] > level)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = (level - tri[..., 2]) / (after[..., 2] - tri[..., 2])
-        points = tri[..., :2] + share[..., None] * (after[..., :2] - tri[..., :2])
+        points = tri + share[..., None] * (after - tri)
     # Exactly two edges of each triangle cross the plane.
-    ends = points[crosses].reshape(-1, 2, 2)
+    ends = points[crosses].reshape(-1, 2, corners.shape[2])
     # The parts outside the grid are clipped below; this bounds their number.
-    n = np.ceil(np.abs(ends[:, 1] - ends[:, 0]).max(axis=1, initial=0) * 2).astype(np.int64) + 1
-    owner, position = _expand(n)
-    t = position / np.maximum(n[owner] - 1, 1)
-    cells = np.floor(ends[owner, 0] + t[:, None] * (ends[owner, 1] - ends[owner, 0])).astype(np.int64)
-    cells = cells[(cells >= 0).all(axis=1) & (cells < (width, height)).all(axis=1)]
-    return np.asarray(cells[:, 1] * width + cells[:, 0])
+    n = np.ceil(np.abs(ends[:, 1, :2] - ends[:, 0, :2]).max(axis=1, initial=0) * 2).astype(np.int64) + 1
+    for run in _chunks(n):
+        owner, position = _expand(n[run])
+        t = position / np.maximum(n[run][owner] - 1, 1)
+        there = ends[run][owner, 0] + t[:, None] * (ends[run][owner, 1] - ends[run][owner, 0])
+        cells = np.floor(there[:, :2]).astype(np.int64)
+        inside = (cells >= 0).all(axis=1) & (cells < (width, height)).all(axis=1)
+        yield cut[run][owner[inside]], cells[inside, 0], cells[inside, 1], there[inside, 3:]
+
+
+def solid_fragments(
+    corners: NDArray[np.float64], surfaces: tuple[Surface, ...], height: int, width: int
+) -> Iterator[Fragments]:
+    """As :func:`fragments`, without those that one sees through.
+
+    :param corners: as for :func:`fragments`
+    :param surfaces: the triangles' coloring, in their order
+    :param height: of the grid, in pixels
+    :param width: of the grid, in pixels
+    """
+    clear = see_through(surfaces)
+    for face, pixel, z in fragments(corners, height, width):
+        if clear.any() and (asked := np.flatnonzero(clear[face])).size:
+            row, column = np.divmod(pixel[asked], width)
+            weights = corner_weights(corners, face[asked], column + 0.5, row + 0.5)
+            kept = np.ones(len(face), dtype=bool)
+            kept[asked] = solid_at(surfaces, face[asked], weights)
+            face, pixel, z = face[kept], pixel[kept], z[kept]
+        yield face, pixel, z

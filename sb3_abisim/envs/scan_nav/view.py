@@ -5,8 +5,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.map import ScanMap
 
+MAX_VIEW_PIXELS = 64_000_000  # of a whole scene
 CAMERA_HEIGHT = 3.0  # m above the floor
 MAX_DEPTH = 10.0  # m, Habitat's
 YELLOW, MAGENTA = (255, 214, 0), (255, 0, 200)
@@ -37,6 +39,12 @@ class SceneView:
     def __init__(self, scan: ScanMap, image_size: int, view_size: float) -> None:
         self.pitch = view_size / image_size
         self.image_size = image_size
+        n_pixels = math.prod(n * scan.meters_per_pixel / self.pitch + image_size + 1 for n in scan.walkable.shape)
+        if n_pixels > MAX_VIEW_PIXELS:
+            raise SceneError(
+                f"{scan.source} at {self.pitch:.3g} m per pixel has {n_pixels:.3g} pixels, more than "
+                f"{MAX_VIEW_PIXELS}; lower image_size, raise view_size, or check the map's meters_per_pixel"
+            )
         surface = ~np.isnan(scan.height)
         above = np.nan_to_num(scan.height)
         nearness = np.where(surface, np.clip((CAMERA_HEIGHT - above) / CAMERA_HEIGHT, 0, 1), 0)

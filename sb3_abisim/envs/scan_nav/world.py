@@ -19,6 +19,8 @@ NODE = 0.05  # m between neighboring nodes
 MIN_START_SHARE = 0.005
 # Places of a scene that are tried as goals before it is refused.
 MAX_GOALS_TRIED = 300
+# Of all goals' fields, each of which is computed when it is first used.
+MAX_FIELD_BYTES = 64 * 2**30
 _SUBSTEP = NODE / 2
 _N_SAMPLES = 16
 _CORNERS = np.array(((0, 0), (0, 1), (1, 0), (1, 1)))
@@ -138,14 +140,32 @@ class ScanWorld:
         self._origins = np.array([scan.origin for scan in scans])
         self._places = [_places(scan, pitch) for scan in scans]
         n_fields = len(scans) * n_goals + n_custom
+        if (n_bytes := n_fields * self._across**2 * 4) > MAX_FIELD_BYTES:
+            raise ValueError(
+                f"{n_goals} goals in each of {len(scans)} scenes would take {n_bytes / 2**30:.0f} GB; lower "
+                "goals_per_scene or view_size"
+            )
         self.custom_fields = np.arange(n_fields - n_custom, n_fields)
         # Memory that is never written is never taken.
         self._fields = np.empty((n_fields, self._across, self._across), dtype=np.float32)
-        self._flat = self._fields.reshape(-1)
         self._ready = np.zeros(n_fields, dtype=bool)
         self.corners = np.zeros((n_fields, 2), dtype=np.int64)  # row and column of the goals
         for scene in range(len(scans)):
             self.prepare_goal(scene, 0)
+
+    @property
+    def _flat(self) -> NDArray[np.float32]:
+        """A view of the fields; kept as an attribute, a copy of the world would have one of something else."""
+        return self._fields.reshape(-1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For ``copy`` and ``pickle``: of the fields, those that have been computed."""
+        return {**self.__dict__, "_fields": self._fields[self._ready]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._fields = np.empty((len(self._ready), self._across, self._across), dtype=np.float32)
+        self._fields[self._ready] = state["_fields"]
 
     def prepare_goal(self, scene: int, k: int) -> int:
         """The field of a scene's goal k.
@@ -187,7 +207,7 @@ class ScanWorld:
         if not np.isfinite(distances[self._middle, self._middle]):
             raise ValueError(f"the goal {goal.tolist()} is not on the walkable floor of {self.scans[scene].source}")
         fields = self.custom_fields[copies]
-        self._fields[fields], self.corners[fields] = distances, corner
+        self._fields[fields], self.corners[fields], self._ready[fields] = distances, corner, True
 
     def goal_positions(self, scenes: NDArray[np.int64], fields: NDArray[np.int64]) -> NDArray[np.float64]:
         """x and y of goals in m, in the scans' coordinates, (n, 2).

@@ -1,5 +1,7 @@
 """Maps as files, in the cache, and from elsewhere."""
 
+import zipfile
+
 import numpy as np
 import pytest
 import trimesh
@@ -100,12 +102,27 @@ def test_refuses_wrong_maps_from_elsewhere(tmp_path, changes, message):
         ScanMap.load(tmp_path / "absent.npz")
 
 
+def member(shape, descr, data=b""):
+    header = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode() + data
+
+
+@pytest.mark.parametrize(("shape", "descr"), [((10**6, 10**6), "|u1"), ((), "<U99999999"), ((10**9, 3), "|u1")])
+def test_a_file_that_declares_more_than_a_map_is_refused_before_it_is_unpacked(tmp_path, shape, descr):
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("walkable.npy", member(shape, descr, bytes(10**6)))
+    with pytest.raises(SceneError, match=r"bomb\.npz declares \d+ bytes of walkable.npy, more than any map"):
+        ScanMap.load(tmp_path / "bomb.npz")
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"meters_per_pixel": 0}, "meters_per_pixel must be a number of meters above 0, got 0"),
         ({"floor": -1}, "floor must be"),
-        ({"up": "x"}, "up must be one of"),
+        ({"up": "w"}, "up must be one of"),
+        ({"flip_faces": "no"}, "flip_faces must be True or False, got 'no'"),
+        ({"meters_per_pixel": 30.0}, "meters_per_pixel must lie between 0.0005 and 1.0, got 30.0"),
         ({"agent_height": 3.0}, "agent_height 3.0 <= cut_height 2.0"),
         ({"color": 1}, "settings of a map are meters_per_pixel"),
     ],
