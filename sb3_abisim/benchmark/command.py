@@ -14,7 +14,7 @@ from sb3_abisim.benchmark.graph import build, run_labels
 from sb3_abisim.benchmark.jobs.job import Job, command_line, is_by_other_code, is_done
 from sb3_abisim.benchmark.jobs.local import Engine, make_engine, run_jobs
 from sb3_abisim.benchmark.plan import Plan
-from sb3_abisim.common.cli import PROGRAM, make_parser, run
+from sb3_abisim.common.cli import PROGRAM, add_trust, make_parser, run
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import methods
 from sb3_abisim.zoo.evaluate import evaluate_final
@@ -180,11 +180,12 @@ def _evaluate_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folder", metavar="RUN", help="a zoo run folder")
     parser.add_argument("--episodes", type=int, default=100, help="on each split and in each mode (default: 100)")
+    add_trust(parser)
     return parser
 
 
 def _evaluate(args: argparse.Namespace) -> None:
-    print(evaluate_final(args.folder, args.episodes))
+    print(evaluate_final(args.folder, args.episodes, args.trust))
 
 
 def _export_parser() -> argparse.ArgumentParser:

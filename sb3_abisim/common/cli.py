@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sb3_abisim.registry import import_network, is_import_path, load_plugins
+from sb3_abisim.registry import import_network, is_import_path, load_plugins, name_package
 
 PROGRAM = "sb3-abisim"
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
@@ -52,6 +52,18 @@ def add_packages(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """Add ``--trust``, for what opens saved models.
+
+    :param parser: of a command
+    """
+    parser.add_argument(
+        "--trust", action="store_true",
+        help="unpickle the model, which executes whatever its zip holds; only for a zip that you or somebody you trust "
+        "made, where its YAML does not say how to build it",
+    )  # fmt: skip
+
+
 def import_packages(names: Sequence[str]) -> None:
     """Import modules that register something, and the plugins of installed packages.
 
@@ -60,6 +72,7 @@ def import_packages(names: Sequence[str]) -> None:
     """
     load_plugins()
     for name in names:
+        name_package(name)
         if is_import_path(name):
             import_network(name)
             continue

@@ -26,7 +26,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
-from sb3_abisim.common.cli import make_parser, parse_pairs, parse_value, run
+from sb3_abisim.common.cli import add_trust, make_parser, parse_pairs, parse_value, run
 from sb3_abisim.common.spaces import sample_actions, space_to_json
 from sb3_abisim.data.copies import FIRST, EnvCopies, WorkerCopies
 from sb3_abisim.data.format import (
@@ -571,7 +571,7 @@ def _steps_of_chain(env: VectorEnv[Any, Any, Any], limit: int) -> tuple[int, int
 
 
 EntryFn = Callable[[str, str | None], dict[str, Any]]
-PolicyFn = Callable[[str, float], Policy]
+PolicyFn = Callable[[str, float, bool], Policy]
 
 
 def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, policy_fn: PolicyFn | None = None) -> None:
@@ -580,7 +580,7 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, pol
     :param argv: its arguments; None for those of the process
     :param entry_fn: from an id and ``--conf-file`` to ``env_wrapper``, ``frame_stack`` and ``env_kwargs``, which flags
         override; None for nothing
-    :param policy_fn: from ``--policy`` and ``--epsilon`` to a policy; None where there is none but chance
+    :param policy_fn: from ``--policy``, ``--epsilon`` and ``--trust`` to a policy; None where there is none but chance
     """
     parser = make_parser(
         "collect",
@@ -628,6 +628,7 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, pol
             "--epsilon", type=float, default=0.0,
             help="probability of a random action in place of the policy's (default: %(default)s)",
         )  # fmt: skip
+        add_trust(parser)
     parser.set_defaults(entry_fn=entry_fn, policy_fn=policy_fn)
     run(parser, argv, _command, "stopped; finished shards are kept, the same command goes on from there")
 
@@ -639,7 +640,7 @@ def _command(args: argparse.Namespace) -> None:
     env_kwargs = {**(entry.get("env_kwargs") or {}), **parse_pairs(args.env_kwargs, "--env-kwargs")}
     wrappers, policy = [parse_value(text) for text in args.env_wrapper], None
     if args.policy_fn is not None and args.policy != "random":
-        policy = args.policy_fn(args.policy, args.epsilon)
+        policy = args.policy_fn(args.policy, args.epsilon, args.trust)
     try:
         collect(
             args.env,

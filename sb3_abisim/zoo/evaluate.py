@@ -25,7 +25,7 @@ N_ENVS = 16
 SEED = 1_000_000
 
 
-def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
+def evaluate_final(folder: str | Path, n_episodes: int = 100, trust: bool = False) -> Path:
     """Evaluate the last model of a run and write ``final_evaluations.npz`` into its folder.
 
     The file holds, for each mode and split (``standard`` where there are no splits), ``<mode>/<split>/results``,
@@ -33,13 +33,14 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
 
     :param folder: of a zoo run that has ended
     :param n_episodes: of each mode on each split
+    :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
     :return: the file
     :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     run = read_run(folder)
-    model = final_model(run)
+    model = final_model(run, trust)
     arrays: dict[str, NDArray[Any]] = {}
     for split in get_traits(run.env_id).splits or (None,):
         env_kwargs = split_kwargs(run.env_id, run.env_kwargs, split)
