@@ -25,7 +25,8 @@ from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_objective, methods
 from sb3_abisim.zoo.methods import MethodSpec
-from sb3_abisim.zoo.runs import Curve, read_run
+from sb3_abisim.zoo.run_files import Curve
+from sb3_abisim.zoo.runs import read_run
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution

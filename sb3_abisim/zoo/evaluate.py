@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_traits
 from sb3_abisim.zoo.run_envs import final_model, make_run_env, split_kwargs
+from sb3_abisim.zoo.run_files import hash_again
 from sb3_abisim.zoo.runs import Run, read_run
 
 FILE_NAME = "final_evaluations.npz"
@@ -39,7 +40,8 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100, trust: bool = Fals
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
-    run = read_run(folder)
+    # An evaluation that was killed may have left half of what belongs together.
+    run = read_run(folder, remade=[FILE_NAME])
     model = final_model(run, trust)
     arrays: dict[str, NDArray[Any]] = {}
     for split in get_traits(run.env_id).splits or (None,):
@@ -51,6 +53,7 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100, trust: bool = Fals
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
     write_atomic(path, lambda file: file.write(buffer.getvalue()))
+    hash_again(run.folder)
     return path
 
 
@@ -74,4 +77,8 @@ def _episodes(
         )
     finally:
         env.close()
+    if not np.isfinite(returns).all():
+        raise FloatingPointError(
+            f"an episode of {run.folder} has a return of NaN or infinity; mend the rewards of {run.env_id}"
+        )
     return {"results": np.array(returns), "ep_lengths": np.array(lengths), "successes": np.array(successes)}

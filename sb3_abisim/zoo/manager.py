@@ -47,6 +47,7 @@ from sb3_abisim.zoo.methods import (
     zoo_hyperparams,
 )
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
+from sb3_abisim.zoo.run_files import hash_run
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
 exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
@@ -183,6 +184,14 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         """
         MethodExperimentManager.has_begun = True
         super().learn(model)
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """As rl-zoo3 does; the run is complete then, and its results get their hashes.
+
+        :param model: that training ended with
+        """
+        super().save_trained_model(model)
+        hash_run(Path(self.save_path))
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         super()._save_config(saved_hyperparams)

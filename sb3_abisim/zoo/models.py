@@ -28,7 +28,8 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_set
 from torch.overrides import TorchFunctionMode
 
 from sb3_abisim.zoo.named import named_class, named_policy_kwargs
-from sb3_abisim.zoo.runs import Run, read_yaml
+from sb3_abisim.zoo.run_files import read_yaml
+from sb3_abisim.zoo.runs import Run
 from sb3_abisim.zoo.saved_spaces import read_space
 
 # Attributes that go on with the weights: plain numbers in the zip.
@@ -97,11 +98,11 @@ def algorithm_class(algo: str) -> type[BaseAlgorithm]:
     :param algo: rl-zoo3's name, such as "ppo"
     :raises ValueError: for an unknown one
     """
-    from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]
-
-    if algo not in ALGOS:
-        raise ValueError(f"unknown algorithm {algo!r}; rl-zoo3 knows {', '.join(sorted(ALGOS))}")
-    found: type[BaseAlgorithm] = ALGOS[algo]
+    # This name stands for itself where another one has been put in place of rl-zoo3's (:mod:`sb3_abisim.zoo.guard`).
+    algos = importlib.import_module("rl_zoo3.exp_manager").ALGOS
+    if algo not in algos:
+        raise ValueError(f"unknown algorithm {algo!r}; rl-zoo3 knows {', '.join(sorted(algos))}")
+    found: type[BaseAlgorithm] = algos[algo]
     return found
 
 

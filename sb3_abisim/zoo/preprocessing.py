@@ -103,15 +103,15 @@ def other_vec_wrappers(settings: Mapping[str, Any]) -> list[str]:
 
 
 def recorded_wrapper(recorded: Any, kind: type = gym.Wrapper, where: str = "") -> Callable[[Any], Any] | None:
-    """The wrappers that a file names, of packages that are imported already.
+    """The wrappers that a file names, see :func:`wrapper_classes`.
 
     :param recorded: ``env_wrapper`` or ``vec_env_wrapper`` as a file holds it
     :param kind: what they must be subclasses of
     :param where: the file, for messages
     :return: wraps one environment; None for no wrapper
-    :raises ValueError: for a wrapper of a package that nobody has imported, or something that is no wrapper
+    :raises ValueError: as :func:`wrapper_classes`
     """
-    found = [_wrapper_class(item, kind, where) for item in items(recorded)]
+    found = wrapper_classes(recorded, kind, where)
     if not found:
         return None
 
@@ -123,12 +123,23 @@ def recorded_wrapper(recorded: Any, kind: type = gym.Wrapper, where: str = "") -
     return wrap
 
 
-def _wrapper_class(item: Any, kind: type, where: str) -> tuple[Any, dict[str, Any]]:
-    path, kwargs = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
-    wrapper_class = named_class(path, kind, where, "wrapper")
-    if not isinstance(kwargs, Mapping):
-        raise ValueError(f"{where} gives the wrapper {path!r} the arguments {kwargs!r}, which are no mapping")
-    return wrapper_class, dict(kwargs)
+def wrapper_classes(recorded: Any, kind: type, where: str) -> list[tuple[Any, dict[str, Any]]]:
+    """The wrappers that a file names, of packages that are imported already.
+
+    :param recorded: ``env_wrapper`` or ``vec_env_wrapper`` as a file holds it
+    :param kind: what they must be subclasses of
+    :param where: the file, for messages
+    :return: each class with its arguments
+    :raises ValueError: for a wrapper of a package that nobody has imported, or something that is no wrapper
+    """
+    found = []
+    for item in items(recorded):
+        path, kwargs = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
+        wrapper_class = named_class(path, kind, where, "wrapper")
+        if not isinstance(kwargs, Mapping):
+            raise ValueError(f"{where} gives the wrapper {path!r} the arguments {kwargs!r}, which are no mapping")
+        found.append((wrapper_class, dict(kwargs)))
+    return found
 
 
 def recorded_preprocessing(recorded: Mapping[str, Any], where: str) -> Preprocessing:

@@ -1,14 +1,17 @@
-"""The spaces in a saved model's zip: pickles, opened by an unpickler that makes spaces and arrays and nothing else."""
+"""Spaces of saved models, and means of VecNormalize: pickles, opened by an unpickler that makes nothing else."""
 
 import base64
 import importlib
 import io
 import pickle
 from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecNormalize
 
 # Whatever else a pickle names is refused. The generators are those of random numbers, whose state a space keeps.
 _NAMES = {
@@ -27,14 +30,23 @@ _NAMES = {
     "numpy.random.bit_generator": {"SeedSequence", "__pyx_unpickle_SeedSequence"},
 }
 
+_NORMALIZE = {
+    "stable_baselines3.common.vec_env.vec_normalize": {"VecNormalize"},
+    "stable_baselines3.common.running_mean_std": {"RunningMeanStd"},
+}
+
 
 class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, names: Mapping[str, set[str]] = MappingProxyType(_NAMES)) -> None:
+        super().__init__(io.BytesIO(data))
+        self._names = names
+
     def find_class(self, module: str, name: str) -> Any:
         """Look a name up in the list alone."""
         # As NumPy 1 wrote it.
         module = module.replace("numpy.core.", "numpy._core.")
-        if name not in _NAMES.get(module, ()):
-            raise ValueError(f"a space names {module}.{name}, which belongs to none")
+        if name not in self._names.get(module, ()):
+            raise ValueError(f"a pickle names {module}.{name}, which is not among what is read here")
         return getattr(importlib.import_module(module), name)
 
 
@@ -46,9 +58,28 @@ def read_space(stored: Any) -> spaces.Space[Any]:
     """
     if not isinstance(stored, Mapping):
         raise ValueError("it says nothing of its spaces")
-    space = _Unpickler(io.BytesIO(base64.b64decode(stored[":serialized:"]))).load()
+    space = _Unpickler(base64.b64decode(stored[":serialized:"])).load()
     _check(space)
     found: spaces.Space[Any] = space
+    return found
+
+
+def read_vec_normalize(path: Path) -> VecNormalize:
+    """What ``VecNormalize.save`` wrote, without executing anything else that the file holds.
+
+    :param path: of a run
+    :return: without an environment
+    :raises ValueError: for anything else
+    """
+    try:
+        found = _Unpickler(path.read_bytes(), _NAMES | _NORMALIZE).load()
+    except OSError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{path} is damaged or holds more than means ({reason}); copy it again") from error
+    if type(found) is not VecNormalize:
+        raise ValueError(f"{path} holds no VecNormalize; copy it again")
     return found
 
 
