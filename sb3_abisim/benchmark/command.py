@@ -17,6 +17,7 @@ from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.common.cli import PROGRAM, add_trust, make_parser, run
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.hashes import write_hashes
+from sb3_abisim.common.text import printable
 from sb3_abisim.registry import methods
 from sb3_abisim.zoo.evaluate import evaluate_final
 from sb3_abisim.zoo.runs import INDEX_NAME, missing_runs
@@ -205,7 +206,10 @@ def _export_parser() -> argparse.ArgumentParser:
 def _export(args: argparse.Namespace) -> None:
     missing = missing_runs(args.folder)
     if missing:
-        print(f"warning: {len(missing)} runs of {INDEX_NAME} are not there: {', '.join(missing)}", file=sys.stderr)
+        print(
+            f"warning: {len(missing)} runs of {INDEX_NAME} are not there: {printable(', '.join(missing))}",
+            file=sys.stderr,
+        )
     print(export(args.folder, args.output))
 
 

@@ -24,9 +24,9 @@ from sb3_abisim.zoo.runs import INDEX_NAME, Run, find_runs
 TEXTS = ("args.yml", "config.yml", "command.txt", "method.json")
 EVALUATIONS = ("evaluations.npz", "final_evaluations.npz")
 # How JSON and YAML write a letter that is not ASCII.
-_ESCAPED = r"\\[xuU][0-9A-Fa-f]+"
+_ESCAPED = r"\\(?:x[0-9A-Fa-f]{2}|u[0-9A-Fa-f]{4}|U[0-9A-Fa-f]{8})"
 # An absolute path up to its last part: not within a word, a relative path or a URL.
-_ABSOLUTE = re.compile(rf"(?<![\w.~/-])/(?:(?:[^\s/'\",:=\\]|{_ESCAPED})+/)*(?=[\w.]|{_ESCAPED})")
+_ABSOLUTE = re.compile(rf"(?<![\w.~/-])/(?:(?:[^\s/'\",:=\\]|{_ESCAPED})++/)*(?=[\w.]|{_ESCAPED})")
 
 
 def export(folder: str | Path, output: str | Path) -> Path:
@@ -38,7 +38,7 @@ def export(folder: str | Path, output: str | Path) -> Path:
     :raises ValueError: if there are no runs, one cannot be read, or ``output`` is there
     """
     folder, output = Path(folder), Path(output)
-    if output.exists():
+    if output.exists() or output.is_symlink():
         raise ValueError(f"{output} is there; remove it, or name another folder")
     runs = find_runs(folder)
     # Under another name until it is whole.

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from sb3_abisim.common.text import printable
 from sb3_abisim.registry import import_network, is_import_path, load_plugins, name_package
 
 PROGRAM = "sb3-abisim"
@@ -114,11 +115,11 @@ def run(
 
 
 def one_line(error: BaseException) -> str:
-    """An exception's message as one line.
+    """An exception's message as one line, with control characters spelled out.
 
     :param error: whose message may have several
     """
-    return " ".join(str(error).split()) or type(error).__name__
+    return printable(" ".join(str(error).split())) or type(error).__name__
 
 
 def parse_pairs(words: Sequence[str], option: str) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def main(argv: Sequence[str]) -> None:
     MethodExperimentManager.has_begun = False
     is_trusted = _TRUST in flags
     try:
-        if command == _UNPICKLES and not is_trusted:
+        if command == _UNPICKLES and not is_trusted and not {"-h", "--help"} & set(flags):
             raise ValueError(
                 f"a file of all_plots is a pickle, which executes whatever it holds; add {_TRUST} for yours"
             )

@@ -222,7 +222,7 @@ class MethodRecord:
         try:
             record = cls(**json.loads(path.read_bytes()))
             texts = record.method, record.encoder, record.encoder_hash
-            if not all(value is None or isinstance(value, str) for value in texts):
+            if not all(value is None or (isinstance(value, str) and value.isprintable()) for value in texts):
                 raise TypeError("a name is no text")
             if not isinstance(record.frozen, bool) or not isinstance(record.preprocessing, dict):
                 raise TypeError("frozen is no bool, or preprocessing no mapping")

@@ -121,11 +121,11 @@ def read_run(folder: str | Path, remade: Sequence[str] = ()) -> Run:
         names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
         return Run(
             folder=folder,
-            label=(record and record.label) or _of_kind(args["algo"], str),
+            label=(record and record.label) or _name(args["algo"]),
             record=record,
-            env_id=_of_kind(args["env"], str),
+            env_id=_name(args["env"]),
             env_name=found[0].parent.name,
-            algo=_of_kind(args["algo"], str),
+            algo=_name(args["algo"]),
             seed=int(args["seed"]),
             n_timesteps=n_timesteps,
             env_kwargs=_of_kind(config.get("env_kwargs") or args["env_kwargs"] or {}, dict),
@@ -135,6 +135,17 @@ def read_run(folder: str | Path, remade: Sequence[str] = ()) -> Run:
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, StopIteration) as error:
         raise ValueError(f"{found[0]} was not written by rl_zoo3.train ({error!r})") from error
+
+
+def _name(value: Any) -> str:
+    if not _is_name(value):
+        raise TypeError(f"{value!r} is no name")
+    return str(value)
+
+
+def _is_name(value: Any) -> bool:
+    """A text that can be shown anywhere: no control characters."""
+    return isinstance(value, str) and value.isprintable() and bool(value)
 
 
 def _of_kind(value: Any, kind: type) -> Any:
@@ -189,10 +200,10 @@ def read_index(folder: Path) -> list[dict[str, str]] | None:
     try:
         entries = json.loads(path.read_bytes())["runs"]
         for entry in entries:
-            if {*entry} != {"folder", "label"} or not all(isinstance(value, str) and value for value in entry.values()):
+            if {*entry} != {"folder", "label"} or not all(_is_name(value) for value in entry.values()):
                 raise ValueError(f"{entry!r} is no run with its label")
             place = PurePosixPath(entry["folder"])
-            if place.is_absolute() or ".." in place.parts or "\\" in entry["folder"] or "\0" in entry["folder"]:
+            if place.is_absolute() or ".." in place.parts or "\\" in entry["folder"]:
                 raise ValueError(f"the run {entry['folder']!r} does not lie below it")
         folders = [entry["folder"] for entry in entries]
         if len(set(folders)) < len(folders):
