@@ -106,6 +106,11 @@ def run(
         parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
     except (OSError, FloatingPointError) as error:
         parser.exit(1, f"{parser.prog}: {one_line(error)}\n")
+    except MemoryError as error:
+        what = str(error) and f" ({one_line(error)})"
+        parser.exit(1, f"{parser.prog}: out of memory{what}; give it smaller inputs, or more memory\n")
+    except RecursionError:
+        parser.exit(2, f"{parser.prog}: error: an input is nested too deeply to be read\n")
     except ValueError as error:
         parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
     except KeyboardInterrupt:

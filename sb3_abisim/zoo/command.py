@@ -74,6 +74,10 @@ def main(argv: Sequence[str]) -> None:
         warnings.filterwarnings("ignore", "'rl_zoo3.plots", RuntimeWarning)
         with guarded() if command in GUARDED and not is_trusted else contextlib.nullcontext():
             runpy.run_module(module, run_name="__main__")
+    except FloatingPointError as error:
+        # Training has stopped, and no model was saved.
+        print(f"{prog}: {one_line(error)}", file=sys.stderr)
+        sys.exit(1)
     except (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error) as error:
         # Of TypeErrors, an unknown hyperparameter or argument of an environment is a mistake of the command.
         is_mistake = not isinstance(error, TypeError) or "unexpected keyword argument" in str(error)

@@ -21,6 +21,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -148,7 +149,20 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     def create_log_folder(self) -> None:
         """As rl-zoo3 does, unless the encoder is missing."""
         self._record = self._make_record()
+        self._claim_folder()
         super().create_log_folder()
+
+    def _claim_folder(self) -> None:
+        """Make the run's folder, or the next one: rl-zoo3 counts first, and runs started together count the same."""
+        os.makedirs(self.log_path, exist_ok=True)
+        while True:
+            try:
+                os.mkdir(self.save_path)
+                return
+            except FileExistsError:
+                number = rl_utils.get_latest_run_id(self.log_path, self.env_name) + 1
+                self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}")
+                self.params_path = f"{self.save_path}/{self.env_name}"
 
     def _make_record(self) -> MethodRecord:
         preprocessing = {key: self._used[key] for key in PREPROCESSING_KEYS if key in self._used}
