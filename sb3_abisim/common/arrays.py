@@ -6,6 +6,7 @@ import os
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ from numpy.typing import NDArray
 MAX_BYTES = 1 << 28
 
 
-def read_npz(path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> dict[str, NDArray[Any]]:
-    """All arrays of an archive.
+def read_npz(
+    path: str | os.PathLike[str], max_bytes: int = MAX_BYTES, names: Sequence[str] | None = None
+) -> dict[str, NDArray[Any]]:
+    """The arrays of an archive.
 
     :param path: the file
     :param max_bytes: that they may take together
+    :param names: of those to read; None for all
     :raises ValueError: naming the file, when it is damaged, being written or larger
     """
     try:
@@ -27,7 +31,8 @@ def read_npz(path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> dict[s
             size = sum(info.file_size for info in archive.infolist())
             if size > max_bytes:
                 raise ValueError(f"it holds {size} bytes, more than {max_bytes}")
-            return {name.removesuffix(".npy"): _read_npy(archive.read(name)) for name in archive.namelist()}
+            found = [name.removesuffix(".npy") for name in archive.namelist()] if names is None else names
+            return {name: _read_npy(archive.read(f"{name}.npy")) for name in found}
     except (
         OSError, EOFError, KeyError, ValueError, TypeError, IndexError, SyntaxError, NotImplementedError, RuntimeError,
         MemoryError, OverflowError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,

@@ -68,6 +68,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     env_kwargs: dict[str, Any]
     eval_env_kwargs: dict[str, Any]
     vec_env_class: type
+    save_path: str
     _hyperparams: dict[str, Any]
     _spec: MethodSpec | None = None
     # Whether a run of this process has begun to train: errors before that are mistakes of the command.

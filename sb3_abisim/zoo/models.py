@@ -25,8 +25,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
-from torch.overrides import TorchFunctionMode
 
+from sb3_abisim.networks.bounded import BoundedTensors
 from sb3_abisim.zoo.named import named_class, named_policy_kwargs
 from sb3_abisim.zoo.run_files import read_yaml
 from sb3_abisim.zoo.runs import Run
@@ -43,9 +43,6 @@ _LEFT_OUT = {
     "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage",
 }  # fmt: skip
 _DATA_NAME = "data"
-# Networks are built more than once (the encoder's, then with the file's weights), and have buffers of their own.
-_N_COPIES, _ROOM_BYTES, _LEAST_BYTES = 16, 64 << 20, 1024
-_FACTORIES = {th.empty, th.zeros, th.ones, th.rand, th.randn, th.full}
 
 
 def load_model(path: Path, run: Run, trust: bool = False) -> BaseAlgorithm:
@@ -69,7 +66,7 @@ def load_model(path: Path, run: Run, trust: bool = False) -> BaseAlgorithm:
     try:
         spaces = read_space(data.get("observation_space")), read_space(data.get("action_space"))
         arguments = model_arguments(run.algo, read_yaml(where), spaces[1], str(where))
-        with _Bounded(_N_COPIES * size + _ROOM_BYTES):
+        with BoundedTensors(size):
             model = _build(run.algo, arguments, *spaces, seed=data.get("seed"))
         _restore(model, path, data)
     except Exception as error:
@@ -187,8 +184,8 @@ def _restore(model: BaseAlgorithm, path: Path, data: Mapping[str, Any]) -> None:
         if value is not None and name in model._get_torch_save_params()[1]:
             recursive_setattr(model, f"{name}.data", value.data)
     for name in _NUMBERS:
-        number = data.get(name)
-        if hasattr(model, name) and type(number) in (int, float) and math.isfinite(number):
+        number = data.get(name, "")
+        if hasattr(model, name) and isinstance(number, int | float) and math.isfinite(number):
             setattr(model, name, number)
     if model.use_sde:
         model.policy.reset_noise()  # type: ignore[operator]
@@ -202,24 +199,3 @@ def _tensors(value: Any) -> Iterator[th.Tensor]:
     elif isinstance(value, list | tuple):
         for part in value:
             yield from _tensors(part)
-
-
-class _Bounded(TorchFunctionMode):
-    """Refuses to build networks that are larger than the file that should fill them.
-
-    :param n_bytes: that all tensors together may take
-    """
-
-    def __init__(self, n_bytes: int) -> None:
-        super().__init__()
-        self._left = n_bytes
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Count, then call."""
-        if func in _FACTORIES:
-            sizes = args[0] if args and isinstance(args[0], list | tuple) else args
-            sizes = (kwargs or {}).get("size", sizes)
-            self._left -= max(4 * math.prod(int(size) for size in sizes), _LEAST_BYTES)
-            if self._left < 0:
-                raise ValueError("it would build larger networks than the zip has weights for")
-        return func(*args, **(kwargs or {}))

@@ -239,7 +239,7 @@ def test_a_space_is_a_space(copied: Run, tmp_path: Path) -> None:
             {"policy_kwargs": {**VANILLA, "features_extractor_kwargs": {"network": "antigravity:Net"}}},
             "names the network 'antigravity:Net'; if you trust it, add --packages antigravity:Net",
         ),
-        ({"policy_kwargs": {**VANILLA, "net_arch": [10**9]}}, "larger networks than the zip has weights for"),
+        ({"policy_kwargs": {**VANILLA, "net_arch": [10**9]}}, "larger networks than the file has weights for"),
         ({"policy_kwargs": {**VANILLA, "net_arch": [7]}}, "cannot be built .*size mismatch|Missing key"),
         ({"learning_rate": [1]}, "Invalid value for learning_rate"),
         ({"gamma": {"a": 1}, "n_envs": "many"}, "cannot be built"),
