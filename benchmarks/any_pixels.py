@@ -126,7 +126,7 @@ CASES = (
         stack=3,
         frozen=True,
         params=("use_sde:False",),
-    ),  # fmt: skip
+    ),
     Case("LunarLander-v3", **RENDERED),
     Case("BipedalWalker-v3", **RENDERED, params=(NO_NORM,)),
     Case("dm_control/cartpole-swingup-v0", "shimmy", **RENDERED),

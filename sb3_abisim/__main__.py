@@ -17,7 +17,7 @@ COMMANDS = {
     "train": ("sb3_abisim.zoo.command", "train an agent: rl-zoo3's train with our methods for --conf-file"),
     "enjoy": ("sb3_abisim.zoo.command", "watch a trained agent: rl-zoo3's enjoy"),
     "record": ("sb3_abisim.zoo.record", "record the agent that a run ended with as a GIF"),
-    "merge": ("sb3_abisim.rl.merge", "put a frozen encoder into the model that was trained on its embeddings"),
+    "merge": ("sb3_abisim.zoo.merge", "put a frozen encoder into the model that was trained on its embeddings"),
     "export": ("sb3_abisim.networks.export", "write an encoder as ONNX or a torch.export program"),
     "analyze": ("sb3_abisim.analysis.command", "show what an encoder sees: figures and numbers"),
     "benchmark": ("sb3_abisim.benchmark.command", "compare methods over environments and seeds, and report"),
@@ -55,10 +55,10 @@ def _preprocessing_entry(env_id: str, conf_file: str | None) -> dict[str, Any]:
     return preprocessing_entry(env_id, conf_file)
 
 
-def _model_policy(name: str, epsilon: float) -> Any:
+def _model_policy(name: str, epsilon: float, trust: bool) -> Any:
     from sb3_abisim.zoo.collect import model_policy
 
-    return model_policy(name, epsilon)
+    return model_policy(name, epsilon, trust)
 
 
 def main(argv: Sequence[str] | None = None) -> None:

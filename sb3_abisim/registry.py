@@ -162,6 +162,7 @@ _IMPORTED_NETWORKS: dict[str, Network] = {}
 _NETWORK_FAMILIES: _Records[Callable[..., Any]] = _Records("family of networks", "sb3_abisim.networks")
 _READERS: _Records[Reader] = _Records("reader", "sb3_abisim.data.readers")
 _TRAITS: dict[str, EnvTraits] = {}
+_NAMED_PACKAGES: set[str] = set()
 _DEFAULT_TRAITS = EnvTraits()
 
 
@@ -356,6 +357,19 @@ def get_traits(env_id: str) -> EnvTraits:
     return _TRAITS.get(env_id, _DEFAULT_TRAITS)
 
 
+def name_package(module: str) -> None:
+    """Note that the user has named a module: files may name what lies in its package from then on.
+
+    :param module: dotted, or ``pkg.module:Factory``
+    """
+    _NAMED_PACKAGES.add(re.split("[.:]", module)[0])
+
+
+def named_packages() -> frozenset[str]:
+    """The top names of the packages that the user has named, by ``--packages`` or by installing a plugin."""
+    return frozenset(_NAMED_PACKAGES)
+
+
 @functools.cache
 def load_plugins() -> None:
     """Import the modules that installed packages name in the entry point group ``sb3_abisim.plugins``, once.
@@ -365,6 +379,7 @@ def load_plugins() -> None:
     for entry_point in metadata.entry_points(group=PLUGIN_GROUP):
         try:
             entry_point.load()
+            name_package(entry_point.value)
         except Exception as error:
             warnings.warn(
                 f"the plugin {entry_point.name} ({entry_point.value}) cannot be loaded and is left out: {error!r}; "

@@ -9,15 +9,18 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_abisim.benchmark.export import INDEX_NAME, export
+from sb3_abisim.benchmark.export import add_hashes, export
 from sb3_abisim.benchmark.graph import build, run_labels
 from sb3_abisim.benchmark.jobs.job import Job, command_line, is_by_other_code, is_done
 from sb3_abisim.benchmark.jobs.local import Engine, make_engine, run_jobs
 from sb3_abisim.benchmark.plan import Plan
-from sb3_abisim.common.cli import PROGRAM, make_parser, run
+from sb3_abisim.common.cli import PROGRAM, add_trust, make_parser, run
 from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.hashes import write_hashes
+from sb3_abisim.common.text import printable
 from sb3_abisim.registry import methods
 from sb3_abisim.zoo.evaluate import evaluate_final
+from sb3_abisim.zoo.runs import INDEX_NAME, missing_runs
 
 DEFAULT_ENV_IDS = ("Nav2D-v0", "PointMaze-v0", "DistractorPointMaze-v0")
 
@@ -41,7 +44,7 @@ def _run_parser() -> argparse.ArgumentParser:
         "Collect, pretrain, train and evaluate for every method, environment and seed; a rerun does only "
         "what is missing. Further commands, each with its --help: `benchmark report` compares the runs, `benchmark "
         "export` makes a small copy for it, `benchmark evaluate` evaluates one run's final model, `benchmark sweep` "
-        "searches settings of pretraining.",
+        "searches settings of pretraining, `benchmark hash` adds hashes to results from before.",
         "benchmark -o benchmark --env PointMaze-v0 --methods abisim ssi vanilla --seeds 0 1 2",
     )
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
@@ -117,6 +120,7 @@ def _run(args: argparse.Namespace) -> None:
     runs = [{"folder": job.output, "label": labels[job.name]} for job in jobs if job.kind == "run"]
     index = {"plan": dataclasses.asdict(plan), "runs": runs}
     write_atomic(root / INDEX_NAME, lambda file: file.write(json.dumps(index, indent=1).encode()))
+    write_hashes(root, [INDEX_NAME])
     if errors:
         print(f"{len(errors)} jobs failed: {', '.join(errors)}; their logs are in {root / 'logs'}", file=sys.stderr)
         sys.exit(1)
@@ -180,11 +184,12 @@ def _evaluate_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("folder", metavar="RUN", help="a zoo run folder")
     parser.add_argument("--episodes", type=int, default=100, help="on each split and in each mode (default: 100)")
+    add_trust(parser)
     return parser
 
 
 def _evaluate(args: argparse.Namespace) -> None:
-    print(evaluate_final(args.folder, args.episodes))
+    print(evaluate_final(args.folder, args.episodes, args.trust))
 
 
 def _export_parser() -> argparse.ArgumentParser:
@@ -199,7 +204,28 @@ def _export_parser() -> argparse.ArgumentParser:
 
 
 def _export(args: argparse.Namespace) -> None:
+    missing = missing_runs(args.folder)
+    if missing:
+        print(
+            f"warning: {len(missing)} runs of {INDEX_NAME} are not there: {printable(', '.join(missing))}",
+            file=sys.stderr,
+        )
     print(export(args.folder, args.output))
+
+
+def _hash_parser() -> argparse.ArgumentParser:
+    parser = make_parser(
+        "benchmark hash",
+        "Write the hashes of results that have none, as runs and exports of before; a changed bit is found then. "
+        "Those that are there are verified.",
+        "benchmark hash results/benchmark",
+    )
+    parser.add_argument("folder", metavar="DIR", help="an export, a benchmark's folder, or a zoo log folder")
+    return parser
+
+
+def _hash(args: argparse.Namespace) -> None:
+    print(f"hashes written into {add_hashes(args.folder)} folders of {args.folder}; all are as they were")
 
 
 def _sweep_parser() -> argparse.ArgumentParser:
@@ -260,5 +286,6 @@ COMMANDS = {
     "report": (_report_parser, _report),
     "evaluate": (_evaluate_parser, _evaluate),
     "export": (_export_parser, _export),
+    "hash": (_hash_parser, _hash),
     "sweep": (_sweep_parser, _sweep),
 }

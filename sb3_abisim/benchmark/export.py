@@ -14,16 +14,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.benchmark.jobs.job import read_manifest
+from sb3_abisim.common.arrays import read_npz
 from sb3_abisim.common.files import write_atomic
-from sb3_abisim.zoo.runs import TRAINING_CURVE, NoEpisodesError, Run, find_runs
+from sb3_abisim.common.hashes import HASHES_NAME, write_hashes
+from sb3_abisim.zoo.run_files import TRAINING_CURVE, NoEpisodesError, hash_run
+from sb3_abisim.zoo.runs import INDEX_NAME, Run, find_runs
 
-INDEX_NAME = "benchmark.json"
-TEXTS = ("args.yml", "config.yml", "command.txt")
+TEXTS = ("args.yml", "config.yml", "command.txt", "method.json")
 EVALUATIONS = ("evaluations.npz", "final_evaluations.npz")
 # How JSON and YAML write a letter that is not ASCII.
-_ESCAPED = r"\\[xuU][0-9A-Fa-f]+"
+_ESCAPED = r"\\(?:x[0-9A-Fa-f]{2}|u[0-9A-Fa-f]{4}|U[0-9A-Fa-f]{8})"
 # An absolute path up to its last part: not within a word, a relative path or a URL.
-_ABSOLUTE = re.compile(rf"(?<![\w.~/-])/(?:(?:[^\s/'\",:=\\]|{_ESCAPED})+/)*(?=[\w.]|{_ESCAPED})")
+_ABSOLUTE = re.compile(rf"(?<![\w.~/-])/(?:(?:[^\s/'\",:=\\]|{_ESCAPED})++/)*(?=[\w.]|{_ESCAPED})")
 
 
 def export(folder: str | Path, output: str | Path) -> Path:
@@ -35,7 +38,7 @@ def export(folder: str | Path, output: str | Path) -> Path:
     :raises ValueError: if there are no runs, one cannot be read, or ``output`` is there
     """
     folder, output = Path(folder), Path(output)
-    if output.exists():
+    if output.exists() or output.is_symlink():
         raise ValueError(f"{output} is there; remove it, or name another folder")
     runs = find_runs(folder)
     # Under another name until it is whole.
@@ -45,15 +48,44 @@ def export(folder: str | Path, output: str | Path) -> Path:
     try:
         for run in runs:
             _copy_run(run, folder, part / run.folder.relative_to(folder))
+            hash_run(part / run.folder.relative_to(folder))
         _copy_manifests(runs, folder, part)
-        index = json.loads((folder / INDEX_NAME).read_bytes()) if (folder / INDEX_NAME).is_file() else {}
+        index = json.loads((folder / INDEX_NAME).read_bytes()) if (folder / INDEX_NAME).is_file() else dict[str, Any]()
         index["runs"] = [{"folder": run.folder.relative_to(folder).as_posix(), "label": run.label} for run in runs]
         _write(part / INDEX_NAME, without_folders(json.dumps(index, indent=1, ensure_ascii=False), folder))
+        hash_index(part)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
     part.rename(output)
     return output
+
+
+def hash_index(root: Path) -> None:
+    """Write the hashes of ``benchmark.json`` and of the manifests of its jobs; those of runs are in their folders.
+
+    :param root: of an export
+    """
+    manifests = [path.relative_to(root).as_posix() for path in (root / "jobs").glob("*.json")]
+    write_hashes(root, [INDEX_NAME, *manifests])
+
+
+def add_hashes(folder: str | Path) -> int:
+    """Give results from before hashes theirs; what has some is verified and stays as it is.
+
+    :param folder: an export, a benchmark's folder whose jobs have ended, or a zoo's log folder
+    :return: number of folders that have got some
+    :raises ValueError: if one is damaged
+    """
+    root, added = Path(folder), 0
+    for run in find_runs(root):
+        if not (run.folder / HASHES_NAME).is_file():
+            hash_run(run.folder)
+            added += 1
+    if (root / INDEX_NAME).is_file() and not (root / HASHES_NAME).is_file():
+        hash_index(root)
+        added += 1
+    return added
 
 
 def without_folders(text: str, root: Path) -> str:
@@ -76,8 +108,7 @@ def _copy_run(run: Run, root: Path, target: Path) -> None:
             _write(target / run.env_name / name, without_folders(source.read_text(encoding="utf-8"), root))
     for name in EVALUATIONS:
         if (run.folder / name).is_file():
-            with np.load(run.folder / name, allow_pickle=False) as arrays:
-                _write_arrays(target / name, dict(arrays))
+            _write_arrays(target / name, read_npz(run.folder / name))
     if not (any(run.folder.glob("*.monitor.csv")) or (run.folder / TRAINING_CURVE).is_file()):
         return
     try:
@@ -95,7 +126,7 @@ def _copy_manifests(runs: list[Run], root: Path, target: Path) -> None:
     """How the runs, and what they rest on, were made: by which command, with which versions, on what, for how long."""
     manifests: dict[str, dict[str, Any]] = {}
     for path in sorted((root / "jobs").glob("*.json")):
-        manifests[path.stem] = json.loads(path.read_bytes())
+        manifests[path.stem] = read_manifest(path)
     outputs = {run.folder.relative_to(root).as_posix() for run in runs}
     names = [name for name, manifest in manifests.items() if manifest["output"] in outputs]
     for name in names:  # grows while it is walked

@@ -23,9 +23,11 @@ from sb3_abisim.benchmark.jobs.local import Engine, run_jobs
 from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.text import spreadsheet_cell
 from sb3_abisim.registry import get_objective, methods
 from sb3_abisim.zoo.methods import MethodSpec
-from sb3_abisim.zoo.runs import Curve, read_run
+from sb3_abisim.zoo.run_files import Curve
+from sb3_abisim.zoo.runs import read_run
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -200,5 +202,5 @@ def _write_table(path: Path, trials: list[Trial], seeds: Sequence[int], metric: 
         returns = trial.returns or [""] * len(seeds)
         value = trial.value if trial.returns else "failed"
         row = [trial.number + 1, *(trial.params[name] for name in names), value, *returns]
-        writer.writerow([*row, " ".join(trial.encoders)])
+        writer.writerow(map(spreadsheet_cell, [*row, " ".join(trial.encoders)]))
     write_atomic(path, lambda file: file.write(text.getvalue().encode()))

@@ -11,7 +11,8 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sb3_abisim.registry import import_network, is_import_path, load_plugins
+from sb3_abisim.common.text import printable
+from sb3_abisim.registry import import_network, is_import_path, load_plugins, name_package
 
 PROGRAM = "sb3-abisim"
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
@@ -52,6 +53,18 @@ def add_packages(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """Add ``--trust``, for what opens saved models.
+
+    :param parser: of a command
+    """
+    parser.add_argument(
+        "--trust", action="store_true",
+        help="unpickle the model, which executes whatever its zip holds; only for a zip that you or somebody you trust "
+        "made, where its YAML does not say how to build it",
+    )  # fmt: skip
+
+
 def import_packages(names: Sequence[str]) -> None:
     """Import modules that register something, and the plugins of installed packages.
 
@@ -60,6 +73,7 @@ def import_packages(names: Sequence[str]) -> None:
     """
     load_plugins()
     for name in names:
+        name_package(name)
         if is_import_path(name):
             import_network(name)
             continue
@@ -92,6 +106,11 @@ def run(
         parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
     except (OSError, FloatingPointError) as error:
         parser.exit(1, f"{parser.prog}: {one_line(error)}\n")
+    except MemoryError as error:
+        what = str(error) and f" ({one_line(error)})"
+        parser.exit(1, f"{parser.prog}: out of memory{what}; give it smaller inputs, or more memory\n")
+    except RecursionError:
+        parser.exit(2, f"{parser.prog}: error: an input is nested too deeply to be read\n")
     except ValueError as error:
         parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
     except KeyboardInterrupt:
@@ -101,11 +120,11 @@ def run(
 
 
 def one_line(error: BaseException) -> str:
-    """An exception's message as one line.
+    """An exception's message as one line, with control characters spelled out.
 
     :param error: whose message may have several
     """
-    return " ".join(str(error).split()) or type(error).__name__
+    return printable(" ".join(str(error).split())) or type(error).__name__
 
 
 def parse_pairs(words: Sequence[str], option: str) -> dict[str, Any]:

@@ -28,15 +28,19 @@ class FolderLockedError(ValueError):
 def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], object], size: int | None = None) -> None:
     """Create or replace a file so that a kill or a full disk leaves the old one (or none), never a part of the new one.
 
-    The parent folder must exist. When this returns, the file and its name have reached the disk.
+    The parent folder must exist. A link stays, and what it leads to is written. When this returns, the file and its
+    name have reached the disk.
 
     :param path: the file
     :param write_fn: called with a binary file open for writing; writes the content
     :param size: bytes to reserve before writing, so that a full disk is found out at once; None reserves nothing.
         It must not exceed what ``write_fn`` writes
+    :raises ValueError: for a device, a pipe or a folder
     :raises OSError: what the system says, ``errno.ENOSPC`` for a full disk; the temporary file is removed
     """
-    path = Path(path)
+    path = Path(os.path.realpath(path))
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is no file that could be replaced; name another")
     # Random, since processes in containers that share a folder have equal numbers, and threads of one have one.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_TEMPORARY_SUFFIX}")
     try:

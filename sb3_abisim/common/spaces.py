@@ -1,5 +1,6 @@
 """Spaces as JSON, what Stable-Baselines3 takes them for, and the actions that a space holds."""
 
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -8,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 # What actions can be; observations are a Box.
+MAX_SPACE_SIZE = 1 << 25
 ActionSpace = spaces.Discrete | spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary
 
 
@@ -42,7 +44,13 @@ def space_from_json(document: dict[str, Any]) -> ActionSpace:
     """The inverse of :func:`space_to_json`.
 
     :param document: what :func:`space_to_json` returned
+    :raises ValueError: for another type, or more than ``MAX_SPACE_SIZE`` numbers: bounds are arrays, which few letters
+        in a file could make as large as they like
     """
+    size = document["shape"] if document["type"] == "Box" else document.get("n") or 1
+    shape = [size] if isinstance(size, int) else list(size)
+    if document["type"] in ("Box", "MultiBinary") and not 0 < math.prod(int(n) for n in shape) <= MAX_SPACE_SIZE:
+        raise ValueError(f"a space of {shape} numbers is empty, or larger than {MAX_SPACE_SIZE}")
     if document["type"] == "Discrete":
         return spaces.Discrete(int(document["n"]), start=int(document["start"]))
     if document["type"] == "MultiDiscrete":

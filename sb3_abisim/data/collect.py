@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-from sb3_abisim.common.cli import make_parser, parse_pairs, parse_value, run
+from sb3_abisim.common.cli import add_trust, make_parser, parse_pairs, parse_value, run
 from sb3_abisim.data.chains import ShardSource
 from sb3_abisim.data.environments import (
     N_BATCHED,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["Policy", "collect", "main"]
 
 EntryFn = Callable[[str, str | None], dict[str, Any]]
-PolicyFn = Callable[[str, float], Policy]
+PolicyFn = Callable[[str, float, bool], Policy]
 
 
 def collect(
@@ -186,7 +186,7 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, pol
     :param argv: its arguments; None for those of the process
     :param entry_fn: from an id and ``--conf-file`` to ``env_wrapper``, ``frame_stack`` and ``env_kwargs``, which flags
         override; None for nothing
-    :param policy_fn: from ``--policy`` and ``--epsilon`` to a policy; None where there is none but chance
+    :param policy_fn: from ``--policy``, ``--epsilon`` and ``--trust`` to a policy; None where there is none but chance
     """
     parser = make_parser(
         "collect",
@@ -234,6 +234,7 @@ def main(argv: Sequence[str] | None = None, entry_fn: EntryFn | None = None, pol
             "--epsilon", type=float, default=0.0,
             help="probability of a random action in place of the policy's (default: %(default)s)",
         )  # fmt: skip
+        add_trust(parser)
     parser.set_defaults(entry_fn=entry_fn, policy_fn=policy_fn)
     run(parser, argv, _command, "stopped; finished shards are kept, the same command goes on from there")
 
@@ -245,7 +246,7 @@ def _command(args: argparse.Namespace) -> None:
     env_kwargs = {**(entry.get("env_kwargs") or {}), **parse_pairs(args.env_kwargs, "--env-kwargs")}
     wrappers, policy = [parse_value(text) for text in args.env_wrapper], None
     if args.policy_fn is not None and args.policy != "random":
-        policy = args.policy_fn(args.policy, args.epsilon)
+        policy = args.policy_fn(args.policy, args.epsilon, args.trust)
     try:
         collect(
             args.env,

@@ -323,13 +323,14 @@ class TransitionDataset:
         path = self.path / array_file(name, shard)
         dtype, row_shape = array_layout(self.meta, name)
         try:
-            array = np.load(path, mmap_mode=mmap_mode, allow_pickle=False)
-        except ValueError as error:
+            # Mapped in any case: where a header declares more than the file has, no memory is taken.
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (ValueError, OverflowError) as error:
             raise DatasetError(f"{path} is not an array file of a dataset: {error}") from None
         expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
         if array.dtype != dtype or array.shape != expected:
             raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
-        return array
+        return np.array(array) if mmap_mode is None else array
 
     def _check_files(self, verify: bool | None) -> None:
         entries = {name: entry for shard in self.meta["shards"] for name, entry in shard["files"].items()}
@@ -368,7 +369,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
     try:
         meta = from_json_file(path / META_NAME)
         check_meta(meta)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError) as error:
         remedy = "run the command that made the dataset again, in a new folder if it refuses"
         raise DatasetError(f"{path / META_NAME} is damaged, or not that of a dataset: {error}; {remedy}") from None
     return meta

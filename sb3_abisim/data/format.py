@@ -214,7 +214,7 @@ def from_json_file(path: Path) -> dict[str, Any]:
     """
     try:
         document = json.loads(path.read_bytes())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path} is damaged ({error})") from None
     if not isinstance(document, dict):
         raise DatasetError(f"{path} is damaged (no JSON object)")
@@ -261,6 +261,22 @@ def check_meta(meta: dict[str, Any]) -> None:
         raise ValueError("its list of shards is not one")
     if make_meta(config, meta["shards"]) != meta:
         raise ValueError("its hash does not match")
+    _check_values(meta)
+
+
+# Arrays are made of as many numbers.
+_MAX_COPIES = 1 << 20
+
+
+def _check_values(meta: dict[str, Any]) -> None:
+    """A hash says that nothing has changed, not that whoever computed it wrote a dataset."""
+    counts = [shard[key] for shard in meta["shards"] for key in ("n_transitions", "n_frames")]
+    sizes = [entry["bytes"] for shard in meta["shards"] for entry in shard["files"].values()]
+    if not all(type(number) is int and number >= 0 for number in (*counts, *sizes)) or not counts:
+        raise ValueError("its numbers of frames and bytes are none")
+    if not isinstance(meta["env_id"], str) or not isinstance(meta["env_kwargs"], dict):
+        raise ValueError("its environment is none")
+    check_spaces(space_from_json(meta["observation_space"]), space_from_json(meta["action_space"]))
 
 
 def _check_chained(meta: dict[str, Any]) -> None:
@@ -268,6 +284,8 @@ def _check_chained(meta: dict[str, Any]) -> None:
     stack = meta["preprocessing"].get("frame_stack", 1)
     if not all(type(number) is int and number >= 1 for number in (*numbers, stack)):
         raise ValueError(f"its numbers of chains {numbers} or stacks {stack!r} are none")
+    if max(meta["n_envs"], stack) > _MAX_COPIES:
+        raise ValueError(f"it has more than {_MAX_COPIES} copies or observations in a stack")
 
 
 def continued_segments(meta: dict[str, Any], lengths: NDArray[np.int64]) -> NDArray[np.int64]:

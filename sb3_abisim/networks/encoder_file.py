@@ -30,9 +30,10 @@ from stable_baselines3.common.preprocessing import is_image_space
 from sb3_abisim._version import __version__
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
-from sb3_abisim.common.spaces import space_to_json
+from sb3_abisim.common.spaces import space_from_json, space_to_json
 from sb3_abisim.common.vocabulary import current_env_kwargs, current_settings
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess
+from sb3_abisim.networks.bounded import BoundedTensors
 from sb3_abisim.registry import import_network, is_import_path, is_known_network, networks
 
 FORMAT = 1
@@ -207,6 +208,17 @@ def load_encoder(name: str | os.PathLike[str], network: str | None = None) -> En
         metadata = document[_METADATA_KEY]
         if set(metadata) - {_PREPROCESSING_KEY} != _METADATA_KEYS:
             raise ValueError(f"the metadata have the keys {sorted(metadata)}, expected {sorted(_METADATA_KEYS)}")
+        texts = metadata["env_id"], metadata["objective"], metadata[_DATASET_HASH_KEY]
+        mappings = (
+            metadata["env_kwargs"],
+            metadata["settings"],
+            metadata["versions"],
+            metadata.get(_PREPROCESSING_KEY, {}),
+        )
+        if not all(isinstance(text, str) for text in texts) or not all(isinstance(part, dict) for part in mappings):
+            raise ValueError("a value of the metadata has the wrong type")
+        if metadata["action_space"] is not None:
+            space_from_json(metadata["action_space"])
         reference, expected = (tensors.pop(key) for key in _REFERENCE_KEYS)
         if reference.dtype != th.uint8 or list(reference.shape[1:]) != metadata["observation_space"]["shape"]:
             raise ValueError(f"reference batch {tuple(reference.shape)} is not of {metadata['observation_space']}")
@@ -216,7 +228,10 @@ def load_encoder(name: str | os.PathLike[str], network: str | None = None) -> En
         encoder = _build(space, spec, tensors)
     except EncoderFileError:
         raise
-    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError) as error:
+    except (
+        AttributeError, IndexError, KeyError, TypeError, ValueError, RuntimeError, RecursionError, SafetensorError,
+        OverflowError, MemoryError, ArithmeticError, AssertionError,
+    ) as error:  # fmt: skip
         raise EncoderFileError(f"{path} is not a valid encoder file ({error!r}); {_REMEDY}") from error
     _check_reference(path, embed(encoder, space, reference), expected)
     metadata.setdefault(_PREPROCESSING_KEY, {})
@@ -360,7 +375,8 @@ def _build(space: spaces.Box, network: dict[str, Any], tensors: dict[str, th.Ten
             blueprint = make_encoder(space, name, **kwargs)
         if blueprint is not None:
             _require_fit(blueprint, weights)
-        encoder = make_encoder(space, name, **kwargs)
+        with BoundedTensors(sum(weight.nbytes for weight in weights.values())):
+            encoder = make_encoder(space, name, **kwargs)
     _require_fit(encoder, weights)
     encoder.load_state_dict(weights)
     encoder.is_pretrained = True

@@ -5,9 +5,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from sb3_abisim.common.paths import resource_path
+from sb3_abisim.common.yaml_text import read_yaml_file
 from sb3_abisim.registry import get_method
 
 # Batches of the eval split that a row of the log is the mean of.
@@ -121,7 +120,7 @@ def load_config(objective: str, env_id: str, overrides: dict[str, Any] | None = 
     """
     custom = get_method(objective).hyperparams
     path = resource_path("hyperparams") / "pretrain" / f"{objective}.yml" if custom is None else Path(custom)
-    entries = yaml.safe_load(path.read_text(encoding="utf-8")) if custom is not None or path.is_file() else {}
+    entries = read_yaml_file(path) if custom is not None or path.is_file() else {}
     mapping = dict(entries.get(env_id, entries.get("default", {})))
     for name, value in (overrides or {}).items():
         outer, _, inner = name.partition(".")

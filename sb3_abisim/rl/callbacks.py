@@ -1,5 +1,8 @@
 """What an RL run reports of its encoder."""
 
+from typing import Any
+
+import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 
@@ -15,11 +18,15 @@ class EncoderCallback(BaseCallback):
     training started with, relative to the norm of the latter. Where actor and critic have separate encoders, it is the
     largest value.
 
+    Training stops at the first reward, observation, loss or weight that is NaN or infinite: some algorithms would train
+    to the end with it, and save a model that knows nothing.
+
     Also prints the content hash of the clips or scans that the training environment shows, if it has one, and lets
     torch reuse memory (:mod:`sb3_abisim.common.malloc`).
 
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
     :raises ValueError: when training starts, if the model was trained on the embeddings of another encoder
+    :raises FloatingPointError: during training, for a number that is not finite
     """
 
     def _on_training_start(self) -> None:
@@ -60,5 +67,31 @@ class EncoderCallback(BaseCallback):
                 max(extractor.relative_weight_change() for extractor in self._extractors),
             )
 
+    def _on_rollout_start(self) -> None:
+        # The update before it has just been logged.
+        self._check_logged()
+
     def _on_step(self) -> bool:
+        self._require_finite("reward", self.locals.get("rewards"))
+        observations = self.locals.get("new_obs")
+        for name, array in observations.items() if isinstance(observations, dict) else [("observation", observations)]:
+            self._require_finite(name, array)
         return True
+
+    def _on_training_end(self) -> None:
+        self._check_logged()
+        for name, parameter in self.model.policy.named_parameters():
+            self._require_finite(f"weight {name}", parameter.detach().cpu().numpy())
+
+    def _check_logged(self) -> None:
+        for name, value in self.logger.name_to_value.items():
+            # Of the others, explained_variance is NaN where all returns are equal.
+            if name.startswith("train/") and "loss" in name:
+                self._require_finite(name, np.asarray(value))
+
+    def _require_finite(self, name: str, array: Any) -> None:
+        if isinstance(array, np.ndarray) and array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise FloatingPointError(
+                f"{name} is NaN or infinite at step {self.num_timesteps}, and training stops; look at the rewards and "
+                "observations of the environment, or lower the learning rate"
+            )

@@ -1,17 +1,13 @@
 """From a model trained on embeddings (``VecEncodeObservations``) to the equal one that acts on observations."""
 
-import argparse
 import io
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 
-from sb3_abisim.common.cli import make_parser, run
 from sb3_abisim.common.spaces import space_from_json
-from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.vec_encode import EncodedBox
 
@@ -74,42 +70,3 @@ def merge_encoder(model: AlgorithmT, encoder: str) -> AlgorithmT:
     if merged.use_sde:
         merged.policy.reset_noise()  # type: ignore[operator]
     return merged
-
-
-def main(argv: Sequence[str] | None = None) -> None:
-    """The command; see ``--help``.
-
-    :param argv: the program's arguments by default
-    """
-    parser = make_parser(
-        "merge",
-        "Put a frozen encoder into the model that was trained on its embeddings; the result acts on observations.",
-        "merge --algo ppo logs/ppo/PointMaze-v0_1/PointMaze-v0.zip -o agent.zip",
-    )
-    parser.add_argument("model", type=Path, metavar="MODEL", help="zip of a model trained on an encoder's embeddings")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="zip to write")
-    parser.add_argument("--algo", required=True, help="its algorithm, by rl-zoo3's name, such as ppo")
-    parser.add_argument("-e", "--encoder", metavar="FILE", help="encoder (default: the copy in the run's folder)")
-    run(parser, argv, _command)
-
-
-def _command(args: argparse.Namespace) -> None:
-    from rl_zoo3 import ALGOS
-
-    if args.algo not in ALGOS:
-        raise ValueError(f"unknown algorithm {args.algo!r}; rl-zoo3 knows {', '.join(sorted(ALGOS))}")
-    if not args.model.is_file():
-        raise ValueError(f"there is no model {args.model}; give the zip in the folder of a run that has ended")
-    encoder = args.encoder
-    if encoder is None:
-        copies = sorted(args.model.parent.glob(f"*/{RUN_COPY}"))
-        if len(copies) != 1:
-            raise ValueError(f"{args.model.parent} holds {len(copies)} encoder files */{RUN_COPY}; give --encoder")
-        encoder = str(copies[0])
-    # As Stable-Baselines3 does.
-    output = args.output if args.output.suffix else args.output.with_suffix(".zip")
-    try:
-        merge_encoder(ALGOS[args.algo].load(args.model, device="cpu"), encoder).save(output)
-    except OSError as error:
-        raise ValueError(f"cannot merge {args.model}: {error}") from error
-    print(f"Wrote {output}, a model that acts on observations")

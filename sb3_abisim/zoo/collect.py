@@ -18,6 +18,7 @@ from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.merge import merge_encoder
 from sb3_abisim.rl.vec_encode import EncodedBox
 from sb3_abisim.zoo.methods import hyperparameters_entry, read_entries
+from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, normalizes_observations, other_vec_wrappers
 from sb3_abisim.zoo.runs import read_run
 
@@ -54,16 +55,14 @@ def preprocessing_entry(env_id: str, conf_file: str | None = None) -> dict[str, 
     return {key: entry[key] for key in sorted(keys) if entry.get(key)}
 
 
-def model_policy(name: str, epsilon: float) -> Policy:
+def model_policy(name: str, epsilon: float, trust: bool = False) -> Policy:
     """A trained model's deterministic actions.
 
-    :param name: folder of a zoo run, whose final model acts, or a model's ``.zip`` in it; models are unpickled, so they
-        must be your own
+    :param name: folder of a zoo run, whose final model acts, or a model's ``.zip`` in it
     :param epsilon: see :class:`~sb3_abisim.data.rollout.Policy`
+    :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
     :raises ValueError: if it is none, or was trained on something else than observations
     """
-    from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]
-
     path = Path(name)
     run = read_run(path if path.is_dir() else path.parent)
     if normalizes_observations(run.settings.get("normalize")):
@@ -71,7 +70,7 @@ def model_policy(name: str, epsilon: float) -> Policy:
     path = run.folder / f"{run.env_name}.zip" if path.is_dir() else path
     if not path.is_file():
         raise ValueError(f"--policy: there is no model {path}; give a run's folder, or a .zip in it")
-    model = ALGOS[run.algo].load(path, device="cpu")
+    model: Any = load_model(path, run, trust)
     if isinstance(model.observation_space, EncodedBox):
         # Trained on embeddings.
         model = merge_encoder(model, str(run.folder / run.env_name / RUN_COPY))

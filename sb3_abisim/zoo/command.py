@@ -1,5 +1,6 @@
 """``sb3-abisim train``, ``enjoy`` and ``zoo``: rl-zoo3's commands with our methods, from any folder."""
 
+import contextlib
 import runpy
 import sys
 import warnings
@@ -9,6 +10,7 @@ import gymnasium as gym
 
 from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs
 from sb3_abisim.registry import is_import_path
+from sb3_abisim.zoo.guard import GUARDED, guarded
 from sb3_abisim.zoo.manager import MethodExperimentManager
 from sb3_abisim.zoo.methods import grammar
 
@@ -23,6 +25,9 @@ SCRIPTS = {
 }
 # Those that import packages themselves; train writes their names into the run's folder.
 _WITH_PACKAGES = ("train", "enjoy")
+# Reads a pickle that only it and its like write.
+_UNPICKLES = "plot_from_file"
+_TRUST = "--trust"
 _PACKAGES = ("--packages", "--gym-packages")
 _PAIRS = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 
@@ -49,10 +54,17 @@ def main(argv: Sequence[str]) -> None:
         if command == "train":
             print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
         print("--packages MODULE ... imports modules that register environments, methods, networks or readers.")
+        if command in (*GUARDED, _UNPICKLES):
+            print(f"{_TRUST} opens the pickles of a run folder, which execute whatever they hold: for your own alone.")
         print(f"example: {prog} {example}\n")
     MethodExperimentManager.has_begun = False
+    is_trusted = _TRUST in flags
     try:
-        words, packages = for_rl_zoo3(flags)
+        if command == _UNPICKLES and not is_trusted and not {"-h", "--help"} & set(flags):
+            raise ValueError(
+                f"a file of all_plots is a pickle, which executes whatever it holds; add {_TRUST} for yours"
+            )
+        words, packages = for_rl_zoo3([flag for flag in flags if flag != _TRUST])
         import_packages(packages)
         modules = [name for name in packages if not is_import_path(name)]
         if modules and command in _WITH_PACKAGES:
@@ -60,7 +72,12 @@ def main(argv: Sequence[str]) -> None:
         sys.argv = [prog, *words]
         # rl_zoo3.plots imports its commands, which runpy would warn of.
         warnings.filterwarnings("ignore", "'rl_zoo3.plots", RuntimeWarning)
-        runpy.run_module(module, run_name="__main__")
+        with guarded() if command in GUARDED and not is_trusted else contextlib.nullcontext():
+            runpy.run_module(module, run_name="__main__")
+    except FloatingPointError as error:
+        # Training has stopped, and no model was saved.
+        print(f"{prog}: {one_line(error)}", file=sys.stderr)
+        sys.exit(1)
     except (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error) as error:
         # Of TypeErrors, an unknown hyperparameter or argument of an environment is a mistake of the command.
         is_mistake = not isinstance(error, TypeError) or "unexpected keyword argument" in str(error)

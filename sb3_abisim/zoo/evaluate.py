@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_traits
 from sb3_abisim.zoo.run_envs import final_model, make_run_env, split_kwargs
+from sb3_abisim.zoo.run_files import hash_again
 from sb3_abisim.zoo.runs import Run, read_run
 
 FILE_NAME = "final_evaluations.npz"
@@ -25,7 +26,7 @@ N_ENVS = 16
 SEED = 1_000_000
 
 
-def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
+def evaluate_final(folder: str | Path, n_episodes: int = 100, trust: bool = False) -> Path:
     """Evaluate the last model of a run and write ``final_evaluations.npz`` into its folder.
 
     The file holds, for each mode and split (``standard`` where there are no splits), ``<mode>/<split>/results``,
@@ -33,13 +34,15 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
 
     :param folder: of a zoo run that has ended
     :param n_episodes: of each mode on each split
+    :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
     :return: the file
     :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
     """
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
-    run = read_run(folder)
-    model = final_model(run)
+    # An evaluation that was killed may have left half of what belongs together.
+    run = read_run(folder, remade=[FILE_NAME])
+    model = final_model(run, trust)
     arrays: dict[str, NDArray[Any]] = {}
     for split in get_traits(run.env_id).splits or (None,):
         env_kwargs = split_kwargs(run.env_id, run.env_kwargs, split)
@@ -50,6 +53,7 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100) -> Path:
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
     write_atomic(path, lambda file: file.write(buffer.getvalue()))
+    hash_again(run.folder)
     return path
 
 
@@ -73,4 +77,8 @@ def _episodes(
         )
     finally:
         env.close()
+    if not np.isfinite(returns).all():
+        raise FloatingPointError(
+            f"an episode of {run.folder} has a return of NaN or infinity; mend the rewards of {run.env_id}"
+        )
     return {"results": np.array(returns), "ep_lengths": np.array(lengths), "successes": np.array(successes)}

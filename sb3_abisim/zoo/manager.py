@@ -21,6 +21,7 @@ import dataclasses
 import functools
 import importlib
 import inspect
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -48,6 +49,7 @@ from sb3_abisim.zoo.methods import (
     zoo_hyperparams,
 )
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
+from sb3_abisim.zoo.run_files import hash_run
 from sb3_abisim.zoo.spaces import check_spaces
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
@@ -70,6 +72,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     frame_stack: int | None
     eval_env_kwargs: dict[str, Any]
     vec_env_class: type
+    save_path: str
     _hyperparams: dict[str, Any]
     _spec: MethodSpec | None = None
     # Whether a run of this process has begun to train: errors before that are mistakes of the command.
@@ -182,7 +185,20 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     def create_log_folder(self) -> None:
         """As rl-zoo3 does, unless the encoder is missing."""
         self._record = self._make_record()
+        self._claim_folder()
         super().create_log_folder()
+
+    def _claim_folder(self) -> None:
+        """Make the run's folder, or the next one: rl-zoo3 counts first, and runs started together count the same."""
+        os.makedirs(self.log_path, exist_ok=True)
+        while True:
+            try:
+                os.mkdir(self.save_path)
+                return
+            except FileExistsError:
+                number = rl_utils.get_latest_run_id(self.log_path, self.env_name) + 1
+                self.save_path = os.path.join(self.log_path, f"{self.env_name}_{number}")
+                self.params_path = f"{self.save_path}/{self.env_name}"
 
     def _make_record(self) -> MethodRecord:
         preprocessing = {key: self._used[key] for key in PREPROCESSING_KEYS if key in self._used}
@@ -218,6 +234,14 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         """
         MethodExperimentManager.has_begun = True
         super().learn(model)
+
+    def save_trained_model(self, model: BaseAlgorithm) -> None:
+        """As rl-zoo3 does; the run is complete then, and its results get their hashes.
+
+        :param model: that training ended with
+        """
+        super().save_trained_model(model)
+        hash_run(Path(self.save_path))
 
     def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
         super()._save_config(saved_hyperparams)

@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
+from sb3_abisim.common.yaml_text import read_yaml_file
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
@@ -221,8 +220,14 @@ class MethodRecord:
         if not path.is_file():
             return None
         try:
-            return cls(**json.loads(path.read_bytes()))
-        except (ValueError, TypeError) as error:
+            record = cls(**json.loads(path.read_bytes()))
+            texts = record.method, record.encoder, record.encoder_hash
+            if not all(value is None or (isinstance(value, str) and value.isprintable()) for value in texts):
+                raise TypeError("a name is no text")
+            if not isinstance(record.frozen, bool) or not isinstance(record.preprocessing, dict):
+                raise TypeError("frozen is no bool, or preprocessing no mapping")
+            return record
+        except (ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{path} is damaged ({error}); leave the run out, or copy the file again") from error
 
 
@@ -298,7 +303,7 @@ def read_entries(path: Path) -> dict[str, Any]:
 
     :param path: the file
     """
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    content = read_yaml_file(path)
     return content if isinstance(content, dict) else {}
 
 

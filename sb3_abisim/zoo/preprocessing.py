@@ -6,10 +6,8 @@ encoder observations makes them by the record (:func:`recorded_preprocessing`) o
 no module is imported because a file names it.
 """
 
-import importlib
 import re
 import shlex
-import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,6 +17,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecTransposeImage
 from sb3_abisim.data.environments import VEC_ENV_KEY, Preprocessing
 from sb3_abisim.networks.encoder_file import EncoderFile
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
+from sb3_abisim.zoo.named import named_class
 
 PREPROCESSING_KEYS = ("env_wrapper", "frame_stack", "normalize")
 
@@ -105,15 +104,15 @@ def other_vec_wrappers(settings: Mapping[str, Any]) -> list[str]:
 
 
 def recorded_wrapper(recorded: Any, kind: type = gym.Wrapper, where: str = "") -> Callable[[Any], Any] | None:
-    """The wrappers that a file names, of packages that are imported already.
+    """The wrappers that a file names, see :func:`wrapper_classes`.
 
     :param recorded: ``env_wrapper`` or ``vec_env_wrapper`` as a file holds it
     :param kind: what they must be subclasses of
     :param where: the file, for messages
     :return: wraps one environment; None for no wrapper
-    :raises ValueError: for a wrapper of a package that nobody has imported, or something that is no wrapper
+    :raises ValueError: as :func:`wrapper_classes`
     """
-    found = [_wrapper_class(item, kind, where) for item in items(recorded)]
+    found = wrapper_classes(recorded, kind, where)
     if not found:
         return None
 
@@ -125,22 +124,23 @@ def recorded_wrapper(recorded: Any, kind: type = gym.Wrapper, where: str = "") -
     return wrap
 
 
-def _wrapper_class(item: Any, kind: type, where: str) -> tuple[Any, dict[str, Any]]:
-    path, kwargs = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
-    module, _, name = str(path).rpartition(".")
-    package = module.partition(".")[0]
-    if package not in sys.modules:
-        raise ValueError(
-            f"{where} names the wrapper {path!r} of a package that is not imported; if you trust it, add --packages "
-            f"{package or path}"
-        )
-    try:
-        wrapper_class = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"{where} names the wrapper {path!r}, which is not there ({error})") from error
-    if not (isinstance(wrapper_class, type) and issubclass(wrapper_class, kind)) or not isinstance(kwargs, Mapping):
-        raise ValueError(f"{where} names {path!r} as a wrapper, which is no {kind.__name__}")
-    return wrapper_class, dict(kwargs)
+def wrapper_classes(recorded: Any, kind: type, where: str) -> list[tuple[Any, dict[str, Any]]]:
+    """The wrappers that a file names, of packages that are imported already.
+
+    :param recorded: ``env_wrapper`` or ``vec_env_wrapper`` as a file holds it
+    :param kind: what they must be subclasses of
+    :param where: the file, for messages
+    :return: each class with its arguments
+    :raises ValueError: for a wrapper of a package that nobody has imported, or something that is no wrapper
+    """
+    found = []
+    for item in items(recorded):
+        path, kwargs = next(iter(item.items())) if isinstance(item, Mapping) and len(item) == 1 else (item, {})
+        wrapper_class = named_class(path, kind, where, "wrapper")
+        if not isinstance(kwargs, Mapping):
+            raise ValueError(f"{where} gives the wrapper {path!r} the arguments {kwargs!r}, which are no mapping")
+        found.append((wrapper_class, dict(kwargs)))
+    return found
 
 
 def recorded_preprocessing(recorded: Mapping[str, Any], where: str) -> Preprocessing:

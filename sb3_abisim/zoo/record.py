@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_abisim.common.cli import make_parser, run
+from sb3_abisim.common.cli import add_trust, make_parser, run
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_traits
 from sb3_abisim.zoo.run_envs import final_model, make_run_env, split_kwargs
@@ -30,7 +30,7 @@ PIXELS = 192
 MAX_FRAMES = 128
 
 
-def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: int = 0) -> float:
+def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: int = 0, trust: bool = False) -> float:
     """Record the final model of a run, in its environment, on the evaluation split where there are splits.
 
     The policy is stochastic: a deterministic one can get stuck at a corner.
@@ -39,6 +39,7 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
     :param path: the GIF to write; the last frame of an episode stays for a second
     :param n_episodes: at least 1
     :param seed: of the episodes and of the actions
+    :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
     :return: share of the recorded episodes that were successful
     :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
     """
@@ -47,7 +48,7 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     zoo_run = read_run(run_folder)
-    model = final_model(zoo_run)
+    model = final_model(zoo_run, trust)
     kwargs = split_kwargs(zoo_run.env_id, zoo_run.env_kwargs, get_traits(zoo_run.env_id).eval_split)
     camera = _Camera()
     env = make_run_env(zoo_run, model, 1, {**kwargs, "render_mode": "rgb_array"}, seed, camera.watch)
@@ -132,6 +133,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the GIF to write")
     parser.add_argument("--episodes", type=int, default=4, help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes (default: %(default)s)")
+    add_trust(parser)
     run(parser, argv, _command)
 
 
@@ -140,5 +142,5 @@ def _command(args: argparse.Namespace) -> None:
         raise ValueError("a GIF needs Pillow; run: pip install 'sb3_abisim[plots]'")
     if not args.output.absolute().parent.is_dir():
         raise ValueError(f"there is no folder {args.output.parent} for {args.output.name}; make it first")
-    success = record(args.run, args.output, args.episodes, args.seed)
+    success = record(args.run, args.output, args.episodes, args.seed, args.trust)
     print(f"Wrote {args.output}; {success:.0%} of its {args.episodes} episodes were successful")

@@ -11,21 +11,21 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStac
 from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
+from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.preprocessing import class_name, items, normalizes_observations, recorded_wrapper
 from sb3_abisim.zoo.runs import Run
 
 Wrapper = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 
 
-def final_model(run: Run) -> BaseAlgorithm:
+def final_model(run: Run, trust: bool = False) -> BaseAlgorithm:
     """The model that a run ended with, on the CPU; it acts in the environments of :func:`make_run_env`.
 
     :param run: a zoo run
-    :raises ValueError: if the run has not ended, if its environment is not registered, or if it was trained on
-        normalized observations
+    :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
+    :raises ValueError: if the run has not ended, if its environment is not registered, if it was trained on normalized
+        observations, or as :func:`~sb3_abisim.zoo.models.load_model`
     """
-    from rl_zoo3.utils import ALGOS
-
     try:
         gym.spec(run.env_id)
     except gym.error.Error as error:
@@ -42,8 +42,7 @@ def final_model(run: Run) -> BaseAlgorithm:
     path = run.folder / f"{run.env_name}.zip"
     if not path.is_file():
         raise ValueError(f"{run.folder} holds no final model ({path.name}); let the run end first")
-    model: BaseAlgorithm = ALGOS[run.algo].load(path, device="cpu")
-    return model
+    return load_model(path, run, trust)
 
 
 def make_run_env(

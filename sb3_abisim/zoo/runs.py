@@ -1,58 +1,28 @@
 """Read the run folders of rl-zoo3, whoever made them, without executing anything that they hold."""
 
 import dataclasses
-import glob
 import json
-import zipfile
-import zlib
-from collections import OrderedDict
-from pathlib import Path
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
+from sb3_abisim.common.hashes import check_hashes
 from sb3_abisim.common.vocabulary import current_result
 from sb3_abisim.zoo.methods import MethodRecord, encoding_kwargs
-
-
-class _Loader(yaml.SafeLoader):
-    """The zoo writes ``!!python`` tags; the three below are data, all others are refused."""
-
-
-_Loader.add_constructor(
-    "tag:yaml.org,2002:python/object/apply:collections.OrderedDict",
-    lambda loader, node: OrderedDict(*loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
-)
-# Of a class or function, its name.
-_Loader.add_multi_constructor("tag:yaml.org,2002:python/name:", lambda loader, suffix, node: suffix)
-_Loader.add_constructor(
-    "tag:yaml.org,2002:python/tuple",
-    lambda loader, node: tuple(loader.construct_sequence(node, deep=True)),  # type: ignore[arg-type]
+from sb3_abisim.zoo.run_files import (
+    TRAINING_CURVE,
+    Curve,
+    read_curve,
+    read_episodes,
+    read_final,
+    read_yaml,
+    result_names,
 )
 
-
-# The training episodes of an exported run, averaged: see Run.training.
-TRAINING_CURVE = "training.npz"
-
-
-class NoEpisodesError(ValueError):
-    """No episode of training has ended."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Curve:
-    """Returns over the course of a run.
-
-    :param steps: environment steps, rising, shape (n,)
-    :param returns: mean return at each, shape (n,)
-    :param successes: share of successful episodes at each, shape (n,); None where the run does not say
-    """
-
-    steps: NDArray[np.int64]
-    returns: NDArray[np.float64]
-    successes: NDArray[np.float64] | None
+INDEX_NAME = "benchmark.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +64,7 @@ class Run:
         path = self.folder / "evaluations.npz"
         if not path.is_file():
             raise ValueError(f"{self.folder} holds no evaluations.npz; train with an --eval-freq above 0")
-        return _read_curve(path)
+        return read_curve(path)
 
     def training(self, n_points: int = 50) -> Curve:
         """The episodes of training itself, with the exploring policy, averaged over equal bins of steps.
@@ -104,17 +74,13 @@ class Run:
         :param n_points: number of bins; those in which no episode ended are left out
         :raises ValueError: if there are neither episodes nor their curve
         """
-        from stable_baselines3.common.monitor import load_results
-
         if not list(self.folder.glob("*.monitor.csv")):
             if (self.folder / TRAINING_CURVE).is_file():
-                return _read_curve(self.folder / TRAINING_CURVE)
+                return read_curve(self.folder / TRAINING_CURVE)
             what = f"{self.folder} holds neither *.monitor.csv nor {TRAINING_CURVE}"
             raise ValueError(f"{what}; take --source evaluations, or the folder that it was exported from")
+        episodes = read_episodes(self.folder)
         # Of copies that step together, the episodes' lengths in the order of their ends add up to the steps.
-        episodes = load_results(glob.escape(str(self.folder)))
-        if not len(episodes):
-            raise NoEpisodesError(f"no episode of {self.folder} has ended yet; try again later, or leave the run out")
         ends = episodes["l"].cumsum().to_numpy()
         bin_index = np.minimum((ends - 1) * n_points // max(self.n_timesteps, int(ends[-1])), n_points - 1)
         width = max(self.n_timesteps, int(ends[-1])) / n_points
@@ -128,33 +94,21 @@ class Run:
         path = self.folder / "final_evaluations.npz"
         if not path.is_file():
             return None
-        return {current_result(name): array for name, array in np.load(path, allow_pickle=False).items()}
+        return {current_result(name): array for name, array in read_final(path).items()}
 
 
-def _read_curve(path: Path) -> Curve:
-    """A curve from arrays as the zoo's EvalCallback writes them.
-
-    :param path: an npz file with ``timesteps`` (n,), ``results`` (n, n_episodes) and, if known, ``successes`` alike
-    :raises ValueError: if it cannot be read
-    """
-    try:
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as data:
-            successes = data["successes"].mean(axis=1) if "successes" in data else None
-            return Curve(data["timesteps"].astype(np.int64), data["results"].mean(axis=1), successes)
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} is damaged or being written ({error!r}); try again, or leave the run out") from error
-
-
-def read_run(folder: str | Path) -> Run:
+def read_run(folder: str | Path, remade: Sequence[str] = ()) -> Run:
     """Read a run folder.
 
     :param folder: ``.../<algo>/<Env-vN>_<id>``
-    :raises ValueError: if it is none
+    :param remade: files in it that the caller makes again, whatever they are
+    :raises ValueError: if it is none, or a file in it is not what it was
     """
     folder = Path(folder)
     found = list(folder.glob("*/args.yml"))
     if len(found) != 1:
         raise ValueError(f"{folder} is no run folder of rl-zoo3 (no <Env>/args.yml in it)")
+    check_hashes(folder, result_names(folder), remade)
     args, config = read_yaml(found[0]), read_yaml(found[0].with_name("config.yml"))
     record = MethodRecord.read(found[0].parent)
     try:
@@ -167,32 +121,48 @@ def read_run(folder: str | Path) -> Run:
         names = ("algo", "env", "env_kwargs", "eval_env_kwargs", "eval_freq", "eval_episodes")
         return Run(
             folder=folder,
-            label=(record and record.label) or str(args["algo"]),
+            label=(record and record.label) or _name(args["algo"]),
             record=record,
-            env_id=args["env"],
+            env_id=_name(args["env"]),
             env_name=found[0].parent.name,
-            algo=args["algo"],
+            algo=_name(args["algo"]),
             seed=int(args["seed"]),
             n_timesteps=n_timesteps,
-            env_kwargs=config.get("env_kwargs") or args["env_kwargs"] or {},
+            env_kwargs=_of_kind(config.get("env_kwargs") or args["env_kwargs"] or {}, dict),
             settings={**{name: args[name] for name in names}, "n_timesteps": n_timesteps, **plain},
-            command=command.read_text() if command.is_file() else "",
+            command=command.read_text(encoding="utf-8", errors="replace") if command.is_file() else "",
             n_eval_episodes=int(args["eval_episodes"]),
         )
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, StopIteration) as error:
         raise ValueError(f"{found[0]} was not written by rl_zoo3.train ({error!r})") from error
+
+
+def _name(value: Any) -> str:
+    if not _is_name(value):
+        raise TypeError(f"{value!r} is no name")
+    return str(value)
+
+
+def _is_name(value: Any) -> bool:
+    """A text that can be shown anywhere: no control characters."""
+    return isinstance(value, str) and value.isprintable() and bool(value)
+
+
+def _of_kind(value: Any, kind: type) -> Any:
+    if not isinstance(value, kind):
+        raise TypeError(f"{value!r} is no {kind.__name__}")
+    return value
 
 
 def find_runs(folder: str | Path) -> list[Run]:
     """All runs below a folder, or those of the last command of a benchmark's folder.
 
     :param folder: a benchmark's folder, a zoo's log folder, or the folder of a run
-    :raises ValueError: if there are none
+    :raises ValueError: if there are none, or one is damaged
     """
     folder = Path(folder)
-    index = folder / "benchmark.json"
-    if index.is_file():
-        entries = json.loads(index.read_bytes())["runs"]
+    entries = read_index(folder)
+    if entries is not None:
         runs = [
             dataclasses.replace(read_run(folder / entry["folder"]), label=entry["label"])
             for entry in entries
@@ -207,6 +177,42 @@ def find_runs(folder: str | Path) -> list[Run]:
     return runs
 
 
+def missing_runs(folder: str | Path) -> list[str]:
+    """The runs that a benchmark's last command asked for, and whose folders are not there.
+
+    :param folder: of a benchmark; any other has none
+    """
+    entries = read_index(Path(folder)) or []
+    return [entry["folder"] for entry in entries if not (Path(folder) / entry["folder"]).is_dir()]
+
+
+def read_index(folder: Path) -> list[dict[str, str]] | None:
+    """What ``benchmark.json`` says of the runs: their folders below it, and their labels.
+
+    :param folder: of a benchmark
+    :return: None where there is no such file
+    :raises ValueError: for a damaged file, or one that names folders elsewhere
+    """
+    path = folder / INDEX_NAME
+    check_hashes(folder, [INDEX_NAME] if path.is_file() else [])
+    if not path.is_file():
+        return None
+    try:
+        entries = json.loads(path.read_bytes())["runs"]
+        for entry in entries:
+            if {*entry} != {"folder", "label"} or not all(_is_name(value) for value in entry.values()):
+                raise ValueError(f"{entry!r} is no run with its label")
+            place = PurePosixPath(entry["folder"])
+            if place.is_absolute() or ".." in place.parts or "\\" in entry["folder"]:
+                raise ValueError(f"the run {entry['folder']!r} does not lie below it")
+        folders = [entry["folder"] for entry in entries]
+        if len(set(folders)) < len(folders):
+            raise ValueError("it names a run twice")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged ({error}); run the benchmark's command again, or copy it again") from error
+    return list(entries)
+
+
 def is_deterministic(env_id: str) -> bool | None:
     """Whether the zoo's evaluations during training are deterministic.
 
@@ -219,18 +225,6 @@ def is_deterministic(env_id: str) -> bool | None:
     if env_id not in gym.registry:
         return None
     return not (ExperimentManager.is_atari(env_id) or ExperimentManager.is_minigrid(env_id))
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file of rl-zoo3 as data; its Python objects become names.
-
-    :param path: ``args.yml`` or ``config.yml``
-    :raises ValueError: if it cannot be read
-    """
-    try:
-        return dict(yaml.load(path.read_text(encoding="utf-8"), _Loader))
-    except (OSError, yaml.YAMLError, TypeError) as error:
-        raise ValueError(f"cannot read {path} ({error}); was it written by rl_zoo3.train?") from error
 
 
 def _without_encoder(policy_kwargs: Any, record: MethodRecord | None) -> Any:

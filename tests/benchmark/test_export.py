@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -90,7 +92,7 @@ def test_nothing_but_what_the_report_reads(copy: Path) -> None:
     names = {path.name for path in copy.rglob("*") if path.is_file() and path.parent.name != "jobs"}
     assert names == {
         "benchmark.json", "args.yml", "config.yml", "command.txt", "evaluations.npz", "final_evaluations.npz",
-        "training.npz",
+        "training.npz", "method.json", "hashes.json",
     }  # fmt: skip
     jobs = {path.stem for path in (copy / "jobs").iterdir()}
     assert jobs == {f"{kind}-{method}{seed}" for kind in ("run", "final") for method in ("abisim", "vanilla")
@@ -145,6 +147,7 @@ def test_a_copy_without_training_curves_says_so(copy: Path, tmp_path: Path, caps
     assert len(list(again.glob("**/training.npz"))) == 4
     for path in again.glob("**/training.npz"):
         path.unlink()
+        (path.parent / "hashes.json").unlink()
     with pytest.raises(SystemExit) as stopped:
         main(["report", str(export(again, tmp_path / "bare")), "--source", "training"])
     assert stopped.value.code == 2
@@ -160,7 +163,7 @@ def test_plain_zoo_logs_and_refusals(tmp_path: Path, copy: Path) -> None:
     with pytest.raises(ValueError, match="no run folders of rl-zoo3 below"):
         export(tmp_path / "nothing", tmp_path / "other")
     np.savez(run / "evaluations.npz", timesteps=np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match="allow_pickle=False"):
+    with pytest.raises(ValueError, match=r"evaluations\.npz is damaged .*object"):
         export(tmp_path / "logs", tmp_path / "pickled")
     assert not list(tmp_path.glob("*pickled*"))
 
@@ -178,3 +181,60 @@ def test_a_run_in_which_no_episode_ended(tmp_path: Path) -> None:
     (run / "0.monitor.csv").write_text('#{"t_start": 0.0}\nr,l,t,is_success\n')
     (copied,) = find_runs(export(tmp_path / "logs", tmp_path / "copy"))
     assert len(copied.evaluations().steps) == len(STEPS) and not (copied.folder / "training.npz").exists()
+
+
+@pytest.mark.parametrize("text", [
+    json.dumps({"a": "/home/" + "Müller-漢字é/" * 40 + "x y/" * 40}),
+    '"/' + "\\xe4bc" * 5000,
+    "/" + "\\u6f22" * 5000 + " /",
+    "/" + "漢" * 50_000 + "'",
+    "/a" * 20_000 + "/ ",
+])  # fmt: skip
+def test_long_paths_take_no_time(text: str, tmp_path: Path) -> None:
+    start = time.process_time()
+    without_folders(text, tmp_path)
+    assert time.process_time() - start < 1.0
+
+
+@pytest.mark.parametrize("name", ["../elsewhere/ppo/A_1", "/elsewhere/ppo/A_1", "runs/../../elsewhere/ppo/A_1"])
+def test_nothing_is_written_outside(original: Path, tmp_path: Path, name: str) -> None:
+    """The list of runs leads above the folder; the run that it names is there."""
+    root = tmp_path / "in" / "benchmark"
+    shutil.copytree(original, root)
+    run = next(path.parents[1] for path in root.rglob("args.yml"))
+    shutil.copytree(run, (root / name.replace("runs/../", "").lstrip("/")).resolve())
+    (root / "benchmark.json").write_text(json.dumps({"runs": [{"folder": name, "label": "x"}]}))
+    before = {*tmp_path.rglob("*")}
+    with pytest.raises(ValueError, match=r"benchmark\.json is damaged .*does not lie below it"):
+        export(root, tmp_path / "out" / "copy")
+    assert {*tmp_path.rglob("*")} == before
+
+
+def test_a_link_is_not_replaced(original: Path, tmp_path: Path) -> None:
+    (tmp_path / "copy").symlink_to(tmp_path / "absent")
+    with pytest.raises(ValueError, match="is there; remove it"):
+        export(original, tmp_path / "copy")
+    assert (tmp_path / "copy").is_symlink()
+
+
+def test_names_do_nothing_but_name(original: Path, tmp_path: Path) -> None:
+    """HTML, formulas and mathematics in labels; control characters in commands."""
+    shutil.copytree(original, tmp_path / "b")
+    index = json.loads((tmp_path / "b" / "benchmark.json").read_bytes())
+    labels = {"abisim": "=HYPERLINK($x^$)", "vanilla": "<script>alert(1)</script>"}
+    for entry in index["runs"]:
+        entry["label"] = labels[entry["label"]]
+    (tmp_path / "b" / "benchmark.json").write_text(json.dumps(index))
+    for path in (tmp_path / "b").rglob("command.txt"):
+        path.write_text("train \x1b]0;title\x07 </pre><script>")
+    page = report([str(tmp_path / "b")], tmp_path / "report")
+    text = page.read_text()
+    assert "<script>" not in text and "&lt;script&gt;alert" in text
+    assert not [letter for letter in text if not letter.isprintable() and letter != "\n"] and "\\x1b]0;title" in text
+    for path in page.parent.glob("*.csv"):
+        assert not re.search(r"(^|,|\")[=@]", path.read_text(), re.MULTILINE), path
+    assert "'=HYPERLINK" in (page.parent / "curves.csv").read_text()
+    index["runs"][0]["label"] = "a\x1bb"
+    (tmp_path / "b" / "benchmark.json").write_text(json.dumps(index))
+    with pytest.raises(ValueError, match="is no run with its label"):
+        find_runs(tmp_path / "b")

@@ -101,3 +101,25 @@ def test_packages_are_imported_first_or_named(capsys: pytest.CaptureFixture[str]
         import_packages(["no_such_module"])
     got, text = outcome(lambda args: pytest.fail("ran"), capsys, "--packages", "no_such_module")
     assert got == 2 and "no_such_module" in text
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "message"),
+    [
+        (PermissionError(13, "Permission denied", "/data/meta.json"), 1, "Permission denied: '/data/meta.json'"),
+        (OSError(28, "No space left on device"), 1, "No space left on device"),
+        (MemoryError(), 1, "out of memory; give it smaller inputs"),
+        (MemoryError("Unable to allocate 8 TiB"), 1, "out of memory (Unable to allocate 8 TiB); give it"),
+        (RecursionError("maximum"), 2, "error: an input is nested too deeply to be read"),
+    ],
+)
+def test_faults_of_the_system_are_one_line(
+    capsys: pytest.CaptureFixture[str], error: BaseException, code: int, message: str
+) -> None:
+    def fail(args: argparse.Namespace) -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as stopped:
+        run(make_parser("x", "d", "x"), [], fail)
+    err = capsys.readouterr().err
+    assert stopped.value.code == code and message in err and err.count("\n") == 1

@@ -156,3 +156,21 @@ def test_lock_on_a_file_that_its_holder_has_just_removed_does_not_count(
     monkeypatch.setattr(fcntl, "flock", flock)
     with folder_lock(tmp_path), pytest.raises(FolderLockedError), folder_lock(tmp_path):
         pass
+
+
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    (tmp_path / "target").write_text("old")
+    (tmp_path / "link").symlink_to("target")
+    (tmp_path / "dangling").symlink_to("made")
+    for name in ("link", "dangling"):
+        write_atomic(tmp_path / name, lambda file: file.write(b"new"))
+        assert (tmp_path / name).is_symlink() and (tmp_path / name).read_text() == "new"
+    assert (tmp_path / "target").read_text() == (tmp_path / "made").read_text() == "new"
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, Path("/dev/null")):
+        with pytest.raises(ValueError, match="is no file that could be replaced"):
+            write_atomic(path, lambda file: file.write(b"new"))
+    assert Path("/dev/null").is_char_device()

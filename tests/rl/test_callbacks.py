@@ -176,3 +176,78 @@ def test_training_keeps_freed_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     model = PPO("CnnPolicy", Grid(), n_steps=8, batch_size=8, n_epochs=1, policy_kwargs=policy_kwargs, device="cpu")
     model.learn(8, callback=EncoderCallback())
     assert calls == [True]
+
+
+class Broken(Grid):
+    """Gives one number that is none, at the twentieth step."""
+
+    def __init__(self, where: str, continuous: bool = False) -> None:
+        super().__init__(continuous)
+        self.where, self.n_steps = where, 0
+        if where == "observation":
+            self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+
+    def _changed(self, observation: Any) -> Any:
+        if self.where != "observation":
+            return observation
+        return np.full(3, np.nan if self.n_steps == 20 else 0, np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = super().reset(seed=seed)
+        return self._changed(observation), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.n_steps += 1
+        observation, reward, _, _, info = super().step(action)
+        reward = np.inf if self.where == "reward" and self.n_steps == 20 else reward
+        return self._changed(observation), reward, False, False, info
+
+
+@pytest.mark.parametrize("where", ["reward", "observation"])
+@pytest.mark.parametrize("algorithm", [DQN, SAC, PPO])
+def test_training_stops_at_a_number_that_is_none(algorithm: type[BaseAlgorithm], where: str) -> None:
+    settings: dict[str, Any] = {"n_steps": 32, "batch_size": 32} if algorithm is PPO else {"buffer_size": 50}
+    policy = "MlpPolicy"
+    if where == "reward":
+        settings["policy_kwargs"] = {"features_extractor_class": VanillaExtractor}
+        policy = "CnnPolicy"
+    model: Any = algorithm(policy, Broken(where, algorithm is SAC), device="cpu", **settings)  # type: ignore[call-arg]
+    with pytest.raises(FloatingPointError, match=f"^{where} is NaN or infinite at step 20, and training stops"):
+        model.learn(64, callback=EncoderCallback())
+
+
+@pytest.mark.parametrize("algorithm", [DQN, PPO])
+def test_training_stops_at_a_loss_or_a_weight_that_is_none(algorithm: type[BaseAlgorithm]) -> None:
+    small = {"n_steps": 16, "batch_size": 16} if algorithm is PPO else {"buffer_size": 50, "learning_starts": 4}
+    kwargs = {"features_extractor_class": VanillaExtractor}
+    model: Any = algorithm("CnnPolicy", Grid(), policy_kwargs=kwargs, device="cpu", **small)  # type: ignore[call-arg]
+    train = model.train
+
+    def break_loss(*args: Any, **kwargs: Any) -> None:
+        train(*args, **kwargs)
+        model.logger.record("train/loss", float("nan"))
+
+    model.train = break_loss
+    with pytest.raises(FloatingPointError, match=r"^train/loss is NaN or infinite"):
+        model.learn(64, callback=EncoderCallback())
+
+    def break_weight(*args: Any, **kwargs: Any) -> None:
+        with th.no_grad():
+            next(model.policy.parameters()).fill_(float("nan"))
+
+    model.train = break_weight
+    with pytest.raises((FloatingPointError, ValueError), match=r"^weight .* is NaN or infinite|invalid values"):
+        model.learn(16, callback=EncoderCallback())
+
+
+def test_an_explained_variance_of_nothing_is_no_mistake() -> None:
+    class Silent(Grid):
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            observation, _, *rest = super().step(action)
+            return observation, 0.0, *rest
+
+    kwargs = {"features_extractor_class": VanillaExtractor}
+    model = PPO("CnnPolicy", Silent(), n_steps=8, batch_size=8, policy_kwargs=kwargs, device="cpu")
+    model.learn(8, callback=EncoderCallback())
+    model.logger.record("train/explained_variance", np.nan)
+    model.learn(8, callback=EncoderCallback(), reset_num_timesteps=False)

@@ -13,8 +13,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.checks import find_extractors
 from sb3_abisim.rl.extractors import ActionBisimExtractor, SSIExtractor
-from sb3_abisim.rl.merge import main, merge_encoder
+from sb3_abisim.rl.merge import merge_encoder
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
+from sb3_abisim.zoo.merge import main
 
 CONTINUOUS = ("SAC", "TD3", "TQC")
 
@@ -135,6 +136,6 @@ def test_mistakes_of_the_command(path: Path, tmp_path: Path, capsys: pytest.Capt
         ("plain.zip", "not on the embeddings of an encoder"),
     ):
         with pytest.raises(SystemExit) as stopped:
-            main([str(tmp_path / model), "-o", str(tmp_path / "out.zip"), "--algo", "ppo", "-e", str(path)])
+            main([str(tmp_path / model), "-o", str(tmp_path / "out.zip"), "--algo", "ppo", "-e", str(path), "--trust"])
         assert stopped.value.code == 2 and message in capsys.readouterr().err
     assert not (tmp_path / "out.zip").exists()

@@ -17,12 +17,12 @@ from torch import nn
 from zoo_inputs import SMALL, run, write_encoder
 
 from sb3_abisim.networks.encoder_file import load_encoder
-from sb3_abisim.rl import merge
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
+from sb3_abisim.zoo import merge
 from sb3_abisim.zoo.command import SCRIPTS, for_rl_zoo3
 from sb3_abisim.zoo.evaluate import evaluate_final
 from sb3_abisim.zoo.manager import MethodExperimentManager
-from sb3_abisim.zoo.runs import read_yaml
+from sb3_abisim.zoo.run_files import read_yaml
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
 

@@ -104,10 +104,29 @@ def is_done(root: Path, job: dict[str, Any]) -> bool:
     :param job: what :meth:`Job.to_json` gave
     """
     try:
-        manifest = json.loads(manifest_path(root, job["name"]).read_bytes())
+        manifest = read_manifest(manifest_path(root, job["name"]))
         return bool(manifest["hash"] == file_hash(root / job["output"] / job["output_file"]))
     except FileNotFoundError:
         return False
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """What a finished job left.
+
+    :param path: see :func:`manifest_path`
+    :raises FileNotFoundError: if it has not
+    :raises ValueError: for a damaged file
+    """
+    try:
+        manifest = json.loads(path.read_bytes())
+        texts = [manifest[key] for key in ("name", "output")]
+        if not all(isinstance(text, str) for text in texts) or manifest["name"] != path.stem:
+            raise ValueError("its name is not that of the file")
+        if not all(isinstance(name, str) for name in manifest["inputs"]):
+            raise ValueError("its inputs are no names")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged ({error!r}); remove it, and its job is done again") from error
+    return dict(manifest)
 
 
 def is_by_other_code(root: Path, job: dict[str, Any]) -> bool:
@@ -116,5 +135,5 @@ def is_by_other_code(root: Path, job: dict[str, Any]) -> bool:
     :param root: the benchmark's folder
     :param job: what :meth:`Job.to_json` gave
     """
-    source = json.loads(manifest_path(root, job["name"]).read_bytes()).get("source")
+    source = read_manifest(manifest_path(root, job["name"])).get("source")
     return source is not None and source != source_hash(job["kind"])

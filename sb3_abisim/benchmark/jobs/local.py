@@ -1,6 +1,5 @@
 """Run the jobs of a benchmark: what is missing, each as soon as its inputs are there, with one display over all."""
 
-import json
 import math
 import os
 import subprocess
@@ -17,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from sb3_abisim._version import __version__
-from sb3_abisim.benchmark.jobs.job import Job, is_by_other_code, is_done, manifest_path
+from sb3_abisim.benchmark.jobs.job import Job, is_by_other_code, is_done, manifest_path, read_manifest
 from sb3_abisim.benchmark.jobs.launch import kill, launch
 from sb3_abisim.common.files import folder_lock
 
@@ -199,7 +198,9 @@ def _measured_rates(root: Path, jobs: Sequence[Job]) -> dict[str, float]:
     for job in jobs:
         path = manifest_path(root, job.name)
         if path.is_file():
-            rates[_rate_name(job)] = json.loads(path.read_bytes())["seconds"] / job.cost
+            seconds = read_manifest(path).get("seconds")
+            if isinstance(seconds, int | float):
+                rates[_rate_name(job)] = seconds / job.cost
     return rates
 
 

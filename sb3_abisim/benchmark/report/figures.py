@@ -25,6 +25,8 @@ DPI = 150
 MINUS = "\N{MINUS SIGN}"
 _STYLE: Any = {
     "font.size": 10,
+    # A label is a text, whatever it holds.
+    "text.parse_math": False,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": GRAY,

@@ -12,7 +12,8 @@ from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.benchmark.report.statistics import Floats
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.registry import get_traits
-from sb3_abisim.zoo.runs import Curve, Run, find_runs
+from sb3_abisim.zoo.run_files import Curve
+from sb3_abisim.zoo.runs import INDEX_NAME, Run, find_runs, missing_runs
 
 STANDARD, LAST_EVALUATION, END_OF_TRAINING = "standard", "last evaluation", "end of training"
 # What stands in place of a split where there is none.
@@ -75,6 +76,21 @@ def labeled_runs(folders: Sequence[str]) -> list[Run]:
         found = find_runs(folder)
         runs += found if label is None else [dataclasses.replace(run, label=label) for run in found]
     return runs
+
+
+def missing_notes(folders: Sequence[str]) -> list[str]:
+    """What of the benchmarks' lists of runs is not there.
+
+    :param folders: as for :func:`labeled_runs`
+    :return: a sentence for each folder that lacks some
+    """
+    notes = []
+    for _, folder in map(split_label, folders):
+        missing = missing_runs(folder)
+        if missing:
+            what = f"{len(missing)} runs of {INDEX_NAME} are not there and not compared"
+            notes.append(f"{folder}: {what}: {', '.join(missing)}.")
+    return notes
 
 
 def split_label(word: str) -> tuple[str | None, str]:

@@ -15,6 +15,7 @@ from sb3_abisim.benchmark.report.figures import MINUS, plot, split_order, thresh
 from sb3_abisim.benchmark.report.groups import WITHOUT_SPLITS, Group, split_label
 from sb3_abisim.benchmark.report.tables import Comparison, Row, compare
 from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.text import printable, spreadsheet_cell
 from sb3_abisim.registry import get_traits, methods
 from sb3_abisim.zoo.runs import Run, is_deterministic
 
@@ -66,7 +67,7 @@ def _csv(rows: list[Row]) -> bytes:
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: spreadsheet_cell(value) for name, value in row.items()} for row in rows)
     return text.getvalue().encode()
 
 
@@ -79,7 +80,7 @@ def render(comparison: Comparison, images: dict[str, bytes]) -> str:
     import jinja2
 
     environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=_shown
     )
     environment.filters |= {
         "number": _number,
@@ -110,6 +111,11 @@ def render(comparison: Comparison, images: dict[str, bytes]) -> str:
         n_resamples=statistics.N_RESAMPLES,
         version=__version__,
     )
+
+
+def _shown(value: Any) -> Any:
+    """A text as plain text; HTML in it is escaped."""
+    return printable(value, "\n") if type(value) is str else value
 
 
 def _acting(comparison: Comparison) -> str:

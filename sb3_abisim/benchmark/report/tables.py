@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_abisim.benchmark.report import statistics
-from sb3_abisim.benchmark.report.groups import Group, group_runs, labeled_runs
+from sb3_abisim.benchmark.report.groups import Group, group_runs, labeled_runs, missing_notes
 from sb3_abisim.benchmark.report.statistics import Floats
 
 # "Final Performance Evaluation", (mean, what follows +-) of the return; the paper does not say what the latter is.
@@ -94,7 +94,7 @@ def compare(
     unknown = [value for value in thresholds if isinstance(value, str) and value not in labels]
     if unknown:
         raise ValueError(f"a threshold is a number or one of {', '.join(labels)}, got {', '.join(unknown)}")
-    notes: list[str] = []
+    notes = missing_notes(folders)
     groups = group_runs(runs, source, reference, notes)
     labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
     aggregates, profiles, improvement = _across(groups, labels, reference, seed, notes)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arrays import read_npz
 from sb3_abisim.envs.backgrounds.clips import FRAME_SHAPE, SIZE, Backgrounds, Clip, array_hash
 
 MEDIA_FOLDER = Path(__file__).resolve().parents[2] / "media"
@@ -40,8 +41,7 @@ def photo_pan(split: str) -> Backgrounds:
 def _load_entry(entry: dict[str, Any]) -> NDArray[np.uint8]:
     """The frames of a clip of the manifest, checked against its sha256."""
     pack = MEDIA_FOLDER / "photo_pan.npz"
-    with np.load(pack, allow_pickle=False) as arrays:
-        differences = arrays[entry["name"]]
+    differences = read_npz(pack, names=[entry["name"]])[entry["name"]]
     # Photographs are stored as differences along a row, shots as differences in time: the file is a third smaller.
     axis = 0 if entry["kind"] == "shot" else 2
     pixels = np.cumsum(differences, axis=axis, dtype=np.uint8)

@@ -66,7 +66,7 @@ class _Entry:
             frames = _map(self.frames_path)
             if len(frames) != note["n_frames"] or array_hash(frames) != note["sha256"]:
                 return None
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, EOFError, ValueError, KeyError, TypeError):
             return None
         load = partial(_map, self.frames_path)
         return Clip(self.source.name, self.source.group, len(frames), note["sha256"], load)
