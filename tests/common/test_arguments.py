@@ -33,7 +33,7 @@ class Thing:
         {"count": np.int8(3)}, {"share": 2}, {"share": np.float32(2)}, {"path": Path("x")}, {"names": ("a", "b")},
         {"names": []}, {"more": {"a": object()}}, {"flag": np.True_}, {"way": "b"}, {"anything": object()},
     ],
-    ids=str,
+    ids=lambda kwargs: "-".join(kwargs) if isinstance(kwargs, dict) else None,
 )  # fmt: skip
 def test_takes_what_fits(kwargs):
     (value,) = kwargs.values()
@@ -56,7 +56,7 @@ def test_takes_what_fits(kwargs):
         ({"color": 1}, "Thing takes no argument 'color'; it takes count, share, path"),
         ({"path": ["x" * 999]}, r"got \['x{10,200}\.\.\."),
     ],
-    ids=str,
+    ids=lambda kwargs: "-".join(kwargs) if isinstance(kwargs, dict) else None,
 )
 def test_names_what_does_not_fit(kwargs, message):
     with pytest.raises(ValueError, match=message):
