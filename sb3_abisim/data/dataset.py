@@ -291,8 +291,8 @@ class TransitionDataset:
         members = np.empty((len(index), self.frame_stack), np.int64)
         members[:, -1] = frame = index.copy()
         for column in range(self.frame_stack - 2, -1, -1):
-            # Before frame 0 stands the last one of all, which ends a segment, too.
-            starts = np.flatnonzero((frame >= 0) & (self._ends[frame - 1] != INSIDE))
+            # For frame 0, and -1, that is one of the last frames: the first segment goes on with none in either case.
+            starts = np.flatnonzero(self._ends[frame - 1] != INSIDE)
             # The first frame of a segment that goes on with another is that one's last.
             before = self._before[np.searchsorted(self._last, frame[starts])]
             frame = np.maximum(frame - 1, -1)
