@@ -71,8 +71,8 @@ def stack_members(
     members = np.empty((len(index), n_stack), np.int64)
     members[:, -1] = frame = index.copy()
     for column in range(n_stack - 2, -1, -1):
-        # Before frame 0 stands the last one of all, which ends a segment, too.
-        starts = np.flatnonzero((frame >= 0) & (ends[frame - 1] != INSIDE))
+        # For frame 0, and -1, that is one of the last frames: the first segment goes on with none in either case.
+        starts = np.flatnonzero(ends[frame - 1] != INSIDE)
         # The first frame of a segment that goes on with another is that one's last.
         goes_on = before[np.searchsorted(last, frame[starts])]
         frame = np.maximum(frame - 1, -1)

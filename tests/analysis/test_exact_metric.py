@@ -6,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from sb3_abisim.analysis import exact_metric
 from sb3_abisim.analysis.exact_metric import action_bisim_metric, behavior_weights
 
 # Three states: 0 -> 1 by action 0 and stays by action 1; 1 -> 2 by both; 2 stays.
@@ -143,6 +144,33 @@ def test_enough_steps_where_the_error_shrinks_by_no_more_than_c(c: float) -> Non
     np.testing.assert_allclose(metric, [[1 / (1 + c)], [c / (1 + c)]], atol=1e-9, rtol=0)
 
 
+def test_enough_steps_around_a_cycle() -> None:
+    """Compared with a state that stays, base 1 at one of 20 states that follow each other: nearly all is error."""
+    n, c, tol = 20, 0.9, 1e-3
+    base = np.eye(n)[:, :1]
+    metric = action_bisim_metric(base, (np.arange(n)[:, None] + 1) % n, np.array([[0]]), c=c, tol=tol)
+    expected = [(1 - c) * c ** ((n - i) % n) / (1 - c**n) for i in range(n)]
+    np.testing.assert_allclose(metric[:, 0], expected, atol=tol, rtol=0)
+
+
+@pytest.mark.parametrize("unit", [2.0**-12, 2.0**12])
+def test_the_unit_of_the_base_makes_no_difference(unit: float) -> None:
+    nexts, base = np.random.default_rng(4).integers(0, 6, (6, 2)), np.random.default_rng(5).random((6, 6))
+    np.testing.assert_array_equal(action_bisim_metric(unit * base, nexts), unit * action_bisim_metric(base, nexts))
+
+
+def test_it_ends_when_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, plain = [], exact_metric._expected_next
+    monkeypatch.setattr(exact_metric, "_expected_next", lambda *args: calls.append(1) or plain(*args))
+    metric = action_bisim_metric(BASE, np.array([[2], [2], [2]]), c=0.5)
+    np.testing.assert_array_equal(metric, BASE / 2)
+    assert len(calls) == 2
+
+
+def test_no_states_have_no_distances() -> None:
+    assert action_bisim_metric(np.zeros((0, 3)), np.zeros((0, 2), int), THREE).shape == (0, 3)
+
+
 def test_ends_where_the_tolerance_is_finer_than_the_floats() -> None:
     metric = action_bisim_metric(BASE.astype(np.float32), THREE, c=0.99, tol=1e-12)
     np.testing.assert_allclose(metric, action_bisim_metric(BASE, THREE, c=0.99, tol=1e-12), rtol=1e-5)
@@ -169,6 +197,7 @@ def test_probabilities_need_pot(monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ({"c": 1.0}, "got 1.0"),
         ({"tol": 0.0}, "got 0.0"),
+        ({"tol": 1.0}, r"tol must lie in \(0, 1\), got 1.0"),
         ({"base_distance": -BASE}, "at least 0"),
         ({"base_distance": np.where(BASE == 5, np.nan, BASE)}, "at least 0"),
         ({"base_distance": BASE.astype(int)}, "int64"),
@@ -178,9 +207,10 @@ def test_probabilities_need_pot(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"other_transitions": THREE[:, :1]}, "same actions, got 2 and 1"),
         ({"other_transitions": np.eye(3)[THREE]}, "same form"),
         ({"transitions": np.full((3, 2, 3), 0.5)}, "adding up to 1"),
+        ({"transitions": np.full((3, 2, 3, 1), 1 / 3)}, "adding up to 1"),
         ({"transitions": np.eye(3)[THREE] * 2 - 1 / 3}, "at least 0, got -0.33"),
         ({"action_weights": np.ones(3) / 3}, r"got shape \(3,\)"),
-        ({"action_weights": np.ones(2)}, "add up to 1"),
+        ({"action_weights": np.ones(2)}, "^action_weights must be at least 0 and add up to 1 over actions$"),
     ],
 )
 def test_wrong_input_is_named(change: dict, message: str) -> None:

@@ -176,7 +176,8 @@ def test_stacks_are_those_of_vec_frame_stack(
             starts.append(next(position))
             next(position)  # the segment's last frame
             actions.append(dataset.actions(starts[-1:])[0])
-        np.testing.assert_array_equal(dataset.frames(starts), shown)
+        np.testing.assert_array_equal(stacks := dataset.frames(starts), shown)
+        assert stacks.dtype == np.uint8
         shown, _, dones, infos = venv.step(np.stack(actions))
         for i in range(N_ENVS):
             expected = infos[i]["terminal_observation"] if dones[i] else shown[i]
