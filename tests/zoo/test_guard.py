@@ -81,3 +81,15 @@ def test_a_pickle_of_curves_needs_trust(monkeypatch: pytest.MonkeyPatch, capsys:
     with pytest.raises(SystemExit) as stopped:
         run(monkeypatch, "zoo", "plot_from_file", "-i", "curves.pkl")
     assert stopped.value.code == 2 and "is a pickle, which executes whatever" in capsys.readouterr().err
+
+
+def test_a_tag_that_only_names_imports_nothing(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(logs, tmp_path / "logs")
+    marker, args = tmp_path / "executed", tmp_path / "logs" / "ppo" / f"{ENV_ID}_1" / ENV_ID / "args.yml"
+    (tmp_path / "named_module.py").write_text(f"import pathlib; pathlib.Path({str(marker)!r}).touch(); x = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    args.write_text("algo: ppo\nenv: CartPole-v1\nseed: 0\nn_timesteps: 256\nenv_kwargs: null\neval_env_kwargs: null\n"
+                    "eval_freq: -1\neval_episodes: 1\nextra: !!python/name:named_module.x ''\n")  # fmt: skip
+    (args.parents[1] / "hashes.json").unlink()
+    enjoy(monkeypatch, tmp_path / "logs")
+    assert not marker.exists()

@@ -105,7 +105,7 @@ def is_done(root: Path, job: dict[str, Any]) -> bool:
     """
     try:
         manifest = read_manifest(manifest_path(root, job["name"]))
-        return bool(manifest["hash"] == file_hash(root / job["output"] / job["output_file"]))
+        return bool(manifest.get("hash") == file_hash(root / job["output"] / job["output_file"]))
     except FileNotFoundError:
         return False
 
@@ -118,15 +118,15 @@ def read_manifest(path: Path) -> dict[str, Any]:
     :raises ValueError: for a damaged file
     """
     try:
-        manifest = json.loads(path.read_bytes())
-        texts = [manifest[key] for key in ("name", "output")]
+        manifest = {"name": path.stem, "output": "", "inputs": [], **json.loads(path.read_bytes())}
+        texts = [manifest[key] for key in ("name", "output", "hash") if key in manifest]
         if not all(isinstance(text, str) for text in texts) or manifest["name"] != path.stem:
             raise ValueError("its name is not that of the file")
         if not all(isinstance(name, str) for name in manifest["inputs"]):
             raise ValueError("its inputs are no names")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is damaged ({error!r}); remove it, and its job is done again") from error
-    return dict(manifest)
+    return manifest
 
 
 def is_by_other_code(root: Path, job: dict[str, Any]) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sb3_abisim.benchmark.jobs.job import Job
+from sb3_abisim.benchmark.jobs.job import Job, read_manifest
 from sb3_abisim.benchmark.jobs.launch import JobError
 from sb3_abisim.benchmark.jobs.local import LocalEngine, done_share, make_engine, run_jobs
 from sb3_abisim.benchmark.jobs.source_hash import source_hash
@@ -113,3 +113,12 @@ def test_unknown_engines_are_refused() -> None:
         make_engine("slurm", 1, 1)
     with pytest.raises(ValueError, match="n_jobs must be at least 1, got 0"):
         LocalEngine(0)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[1]", "{", '{"hash": 3}', '{"name": "run-b"}', '{"inputs": [1]}', "[" * 100_000]
+)
+def test_a_damaged_manifest_is_named(tmp_path: Path, content: str) -> None:
+    (tmp_path / "run-a.json").write_text(content)
+    with pytest.raises(ValueError, match=r"run-a\.json is damaged .*; remove it, and its job is done again"):
+        read_manifest(tmp_path / "run-a.json")
