@@ -19,6 +19,7 @@ from gymnasium.vector import VectorEnv
 
 from sb3_abisim.common.cli import make_parser, parse_pairs, parse_value, run
 from sb3_abisim.data.chains import ShardSource
+from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.environments import (
     N_BATCHED,
     N_COPIES,
@@ -28,6 +29,7 @@ from sb3_abisim.data.environments import (
     resolve_wrapper,
 )
 from sb3_abisim.data.format import CONFIG_NAME, TERMINATED, TRUNCATED, DatasetError, from_json_file
+from sb3_abisim.data.image_warning import warn_of_images
 from sb3_abisim.data.rollout import Policy
 from sb3_abisim.data.vectorized import is_vectorized
 from sb3_abisim.data.writer import check_folder, open_writer
@@ -174,6 +176,7 @@ def _collect(source: ShardSource, n_transitions: int, folder: Path, progress: bo
             "(--env-kwargs max_episode_steps:K)",
             stacklevel=3,
         )
+    warn_of_images(TransitionDataset(folder, verify=False), stacklevel=4)
     if progress:
         state = "already complete, nothing to do" if was_finished and not written else "complete"
         print(f"{folder}: {n_transitions} transitions of {source.identity['env_id']}, {state} (hash {hash[:16]})")
