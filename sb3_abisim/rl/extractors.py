@@ -115,7 +115,8 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
             if not (math.isfinite(low) and math.isfinite(high))
             else "remove normalize_images=False from policy_kwargs, or correct the environment's observations"
         )
-        raise ValueError(f"observations reach {low:g}..{high:g}, but {self._label} takes images in 0..1; {remedy}")
+        extent = f"{high:g}" if low >= 0.0 else f"{low:g}..{high:g}"
+        raise ValueError(f"observations reach {extent}, but {self._label} takes images in 0..1; {remedy}")
 
     def _check_input(self, observations: th.Tensor) -> None:
         if th.compiler.is_exporting() or th.compiler.is_compiling():
