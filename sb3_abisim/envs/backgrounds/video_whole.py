@@ -87,12 +87,28 @@ def _check_ogg(file: BinaryIO, size: int) -> bool:
     return True
 
 
-def _check_webp(file: BinaryIO, size: int) -> bool:
-    """Its header says how long it is."""
-    (length,) = struct.unpack("<I", _take(file, 8)[4:])
+def _check_riff(file: BinaryIO, size: int) -> bool:
+    """WebP and AVI say how long they are; an AVI may go on behind that, and says how many frames there are."""
+    head = _take(file, 12)
+    (length,) = struct.unpack("<I", head[4:8])
     if size < length + 8:
         raise _Damage(f"{size} of {length + 8} bytes")
-    return True
+    return head[8:] == b"WEBP"
+
+
+def _check_matroska(file: BinaryIO, size: int) -> bool:
+    """The header, then one segment that says how long it is, unless it was written as a live stream."""
+    for name in (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"):
+        if _take(file, 4) != name:
+            raise _Damage("its segment is missing")
+        first = _take(file, 1)[0]
+        n = 9 - first.bit_length()
+        value = int.from_bytes(bytes([first & (0xFF >> n)]) + _take(file, n - 1), "big")
+        if value != 2 ** (7 * n) - 1 and file.tell() + value > size:
+            raise _Damage(f"{size} of {file.tell() + value} bytes")
+        if name.startswith(b"\x1a"):
+            file.seek(value, os.SEEK_CUR)
+    return False
 
 
 def _check_mp4(file: BinaryIO, size: int) -> bool:
@@ -131,7 +147,8 @@ def _check_mpeg(file: BinaryIO, size: int) -> bool:
 _CHECKS: tuple[tuple[Callable[[bytes], bool], Callable[[BinaryIO, int], bool]], ...] = (
     (lambda head: head.startswith(b"GIF8"), _check_gif),
     (lambda head: head.startswith(b"OggS"), _check_ogg),
-    (lambda head: head[:4] == b"RIFF" and head[8:12] == b"WEBP", _check_webp),
+    (lambda head: head[:4] == b"RIFF" and head[8:12] in (b"WEBP", b"AVI "), _check_riff),
+    (lambda head: head.startswith(b"\x1a\x45\xdf\xa3"), _check_matroska),
     (lambda head: head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"), _check_mp4),
     (lambda head: head[:4] in (b"\x00\x00\x01\xba", b"\x00\x00\x01\xb3"), _check_mpeg),
 )
