@@ -21,8 +21,8 @@ ENCODER = "Nav2D-v0/abisim"
 SPACE = spaces.Box(0, 255, (3, 15, 15), np.uint8)
 
 
-class Pictures(gym.Env[Any, Any]):
-    """Random pictures between two values."""
+class Images(gym.Env[Any, Any]):
+    """Random images between two values."""
 
     observation_space = SPACE
     action_space = spaces.Discrete(2)
@@ -66,7 +66,7 @@ class Breaks(VecEnvWrapper):
 
 
 def venv(n: int = 2, *args: Any, wrapper: Any = lambda env: env) -> DummyVecEnv:
-    return DummyVecEnv([lambda: wrapper(Pictures(*args))] * n)
+    return DummyVecEnv([lambda: wrapper(Images(*args))] * n)
 
 
 def kwargs() -> dict[str, Any]:

@@ -18,8 +18,8 @@ from sb3_abisim.envs.backgrounds.video_roles import (
     SIDECAR_SUFFIXES,
     VIDEO_SUFFIXES,
     is_other_role,
+    require_images,
     require_one_series,
-    require_pictures,
 )
 from sb3_abisim.envs.backgrounds.video_whole import is_animated_webp
 
@@ -30,7 +30,7 @@ TRAIN_FOLDERS = ("train", "training")
 EVAL_FOLDERS = ("eval", "evaluation", "val", "valid", "validation", "test", "testing")
 # Of each video beside them; more images are frames.
 MAX_THUMBNAILS = 4
-# Where the pictures of DAVIS lie, the smaller ones first.
+# Where the images of DAVIS lie, the smaller ones first.
 _DAVIS_SIZES = ("480p", "Full-Resolution")
 # Names in a warning.
 _MAX_NAMED = 12
@@ -97,7 +97,7 @@ def find_sources(root: Path) -> tuple[Source, ...]:
 
     :param root: the folder
     :raises ValueError: for a folder that is missing, not a folder, without videos, with frames beside video files, or
-        with images that may be no pictures
+        with images that may be masks
     """
     found = explore(root)
     if not found.sources:
@@ -142,7 +142,7 @@ def explore(root: Path) -> Found:
                 found.leave_out(child, root, "beside the folders of the two sides")
     else:
         _find(root, None, root, found)
-    require_pictures(found.sources)
+    require_images(found.sources)
     return found
 
 
@@ -176,7 +176,7 @@ def _find(root: Path, split: str | None, top: Path, found: Found) -> None:
             relative = path.relative_to(root)
             parts = relative.parts or (root.name,)
             youtube = _YOUTUBE_ID.search(relative.stem)
-            # The first that says which clip it is, not that pictures lie there.
+            # The first that says which clip it is, not that images lie there.
             own = [part for part in parts if part.lower() not in CONTAINER_FOLDERS] or [parts[-1]]
             group = (youtube[1] or youtube[2]) if youtube else prefix + own[0]
             found.sources.append(_source(prefix + "/".join(parts), group, path, tuple(files), split))

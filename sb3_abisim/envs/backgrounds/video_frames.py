@@ -112,7 +112,7 @@ def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", floa
 
 
 def _video_stream(container: Any, path: Path) -> Any:
-    """The video, which is no cover picture."""
+    """The video, which is no cover image."""
     cover = _import_decoder("av.stream").Disposition.attached_pic
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
@@ -190,14 +190,14 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
                         f"{file} has more than 8 bits per value ({image.mode}); convert {source.path} to 8 bits"
                     )
                 if getattr(image, "n_frames", 1) > 1:
-                    raise ClipError(f"{file} holds several pictures; make it a video, or remove {source.path}")
+                    raise ClipError(f"{file} holds several frames; make it a video, or remove {source.path}")
                 yield ops.exif_transpose(image).convert("RGB")
         except (OSError, SyntaxError, image_module.DecompressionBombError) as error:
             raise ClipError(f"{file} cannot be decoded ({error}); replace the file or remove {source.path}") from error
 
 
 def _decode_webp(path: Path) -> Iterator["Image.Image"]:
-    """The pictures of an animated WebP."""
+    """The images of an animated WebP."""
     image_module = _import_decoder("PIL.Image")
     require_whole(path)
     try:

@@ -1,4 +1,4 @@
-"""Which folders and files of a data set are pictures, and which are masks, depth and the like beside them."""
+"""Which folders and files of a data set are images, and which are masks, depth and the like beside them."""
 
 import re
 from collections import defaultdict
@@ -13,7 +13,7 @@ SIDECAR_SUFFIXES = (
     ".txt", ".json", ".xml", ".csv", ".tsv", ".srt", ".vtt", ".ass", ".md", ".yml", ".yaml", ".nfo", ".html", ".url",
     ".pdf", ".log", ".sha256", ".md5", ".ini", ".db",
 )  # fmt: skip
-# Words for what is not a picture of a scene, as names of folders and at the ends of names.
+# Words for what is not a image of a scene, as names of folders and at the ends of names.
 OTHER_ROLES = frozenset(
     (
         "annotation",
@@ -54,7 +54,7 @@ OTHER_ROLES = frozenset(
         "albedo",
     )
 )
-# Folders of which the name says that pictures lie there, not of which clip.
+# Folders of which the name says that images lie there, not of which clip.
 CONTAINER_FOLDERS = frozenset(("jpegimages", "480p", "1080p", "full-resolution", "rgb", "images", "frames", "color"))
 # A mask or a code has no more colors than this.
 _MAX_COLORS = 16
@@ -107,7 +107,7 @@ def require_one_series(folder: Path, images: Iterable[Path]) -> None:
                 )
 
 
-def require_pictures(sources: Iterable[_Clip]) -> None:
+def require_images(sources: Iterable[_Clip]) -> None:
     """Refuse folders of frames that look like masks or depth, by their middle frames.
 
     Palettes and gray images of few values are masks. Beside folders of color, folders of gray or of few colors are

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 _CUT = "{path} is cut off or damaged ({why}); get a complete copy, or remove it"
 _MPEG_END = (b"\x00\x00\x01\xb7", b"\x00\x00\x01\xb9")
-# A program stream may be padded behind its last picture.
+# A program stream may be padded behind its last image.
 _MPEG_TAIL = 2**16
 
 
@@ -155,7 +155,7 @@ _CHECKS: tuple[tuple[Callable[[bytes], bool], Callable[[BinaryIO, int], bool]], 
 
 
 def is_animated_webp(path: os.PathLike[str]) -> bool:
-    """Whether a file is a WebP of several pictures.
+    """Whether a file is a WebP of several frames.
 
     :param path: of a regular file
     """

@@ -12,7 +12,7 @@ from sb3_abisim.envs.backgrounds.video_files import find_sources
 from sb3_abisim.envs.backgrounds.video_roles import is_other_role
 
 
-def pictures(folder, seed=0, n=16):
+def images(folder, seed=0, n=16):
     folder.mkdir(parents=True)
     pixels = np.random.default_rng(seed).integers(0, 255, (24, 32, 3), dtype=np.uint8)
     for i in range(n):
@@ -40,7 +40,7 @@ def names(root):
 
 def test_masks_of_mose_are_left_out(folder):
     for seed, clip in enumerate(("a", "b", "c", "d")):
-        pictures(folder / "JPEGImages" / clip, seed), masks(folder / "Annotations" / clip)
+        images(folder / "JPEGImages" / clip, seed), masks(folder / "Annotations" / clip)
     with pytest.warns(UserWarning, match=r"left out of 4 clips in .*: Annotations \(masks, depth or the like"):
         sides = names(folder)
     assert sorted(sides["train"] + sides["eval"]) == [f"JPEGImages/{clip}" for clip in "abcd"]
@@ -50,10 +50,10 @@ def test_masks_of_mose_are_left_out(folder):
 def test_masks_of_youtube_vos_are_left_out(folder):
     for seed, (side, clip) in enumerate((s, c) for s in ("train", "valid") for c in "ab"):
         (
-            pictures(folder / side / "JPEGImages" / (side + clip), seed),
+            images(folder / side / "JPEGImages" / (side + clip), seed),
             masks(folder / side / "Annotations" / (side + clip)),
         )
-    pictures(folder / "train_all_frames" / "x", 9)
+    images(folder / "train_all_frames" / "x", 9)
     with pytest.warns(UserWarning, match=r"left out") as warned:
         sides = names(folder)
     assert sides["train"] == ["train/JPEGImages/traina", "train/JPEGImages/trainb"]
@@ -66,7 +66,7 @@ def test_masks_of_youtube_vos_are_left_out(folder):
 def test_davis_of_any_resolution(folder, sizes):
     for size in sizes:
         for seed, clip in enumerate(("bear", "camel", "dog")):
-            pictures(folder / "JPEGImages" / size / clip, seed), masks(folder / "Annotations" / size / clip)
+            images(folder / "JPEGImages" / size / clip, seed), masks(folder / "Annotations" / size / clip)
     (folder / "ImageSets" / "2017").mkdir(parents=True)
     (folder / "ImageSets" / "2017" / "train.txt").write_text("bear\ncamel\n")
     (folder / "ImageSets" / "2017" / "val.txt").write_text("dog\n")
@@ -74,9 +74,9 @@ def test_davis_of_any_resolution(folder, sizes):
     assert {source.path.parent.name for source in find_sources(folder)} == {sizes[0]}
 
 
-def test_depth_beside_pictures_of_each_clip(folder):
+def test_depth_beside_images_of_each_clip(folder):
     for seed, clip in enumerate(("x", "y")):
-        pictures(folder / clip / "rgb", seed), masks(folder / clip / "depth", "depth")
+        images(folder / clip / "rgb", seed), masks(folder / clip / "depth", "depth")
         masks(folder / f"{clip}_mask")
     with pytest.warns(UserWarning, match="x/depth.*x_mask|x_mask.*x/depth"):
         assert sorted(source.name for source in find_sources(folder)) == ["x/rgb", "y/rgb"]
@@ -93,14 +93,14 @@ def test_depth_beside_pictures_of_each_clip(folder):
     ],
 )
 def test_masks_of_an_unknown_name_are_refused(folder, mode, said):
-    pictures(folder / "a"), pictures(folder / "b", 1), masks(folder / "z", mode)
+    images(folder / "a"), images(folder / "b", 1), masks(folder / "z", mode)
     with pytest.raises(ValueError, match=said):
         find_sources(folder)
 
 
 def test_masks_among_their_frames_are_refused(folder):
     for pattern in ("{:05d}.png", "{:05d}_mask.png", "depth{}.png"):
-        pictures(folder / "a"), masks(folder / "a", pattern=pattern)
+        images(folder / "a"), masks(folder / "a", pattern=pattern)
         with pytest.raises(ValueError, match=r"a holds several images of one number, N\.jpg and "):
             find_sources(folder)
         shutil.rmtree(folder / "a")
@@ -147,7 +147,7 @@ def test_pipes_and_links_to_nothing_do_not_hang(folder):
 
 
 def test_what_was_understood_is_printed_before_decoding(folder, capsys):
-    pictures(folder / "a"), pictures(folder / "b", 1)
+    images(folder / "a"), images(folder / "b", 1)
     load_backgrounds(folder)
     text = capsys.readouterr().err
     assert f"clips in {folder}:" in text and "a (16 frames)" in text and "  eval   " in text and "  train  " in text

@@ -196,10 +196,10 @@ def test_the_aspect_of_pixels_comes_from_the_header(folder):
     assert {aspect for _, aspect in decode_video(folder / "a.mp4")} == {2.0}
 
 
-def test_an_image_of_several_pictures_is_refused(folder):
+def test_an_image_of_several_images_is_refused(folder):
     for seed in range(2):
         write_frames(folder / str(seed), seed)
-        pictures = [Image.new("RGB", (80, 60), (i, seed, 9)) for i in range(3)]
-        pictures[0].save(folder / str(seed) / "frame4.png", save_all=True, append_images=pictures[1:])
-    with pytest.raises(ClipError, match=r"frame4\.png holds several pictures"):
+        images = [Image.new("RGB", (80, 60), (i, seed, 9)) for i in range(3)]
+        images[0].save(folder / str(seed) / "frame4.png", save_all=True, append_images=images[1:])
+    with pytest.raises(ClipError, match=r"frame4\.png holds several frames"):
         load_backgrounds(folder)
