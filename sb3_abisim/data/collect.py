@@ -19,6 +19,7 @@ from gymnasium.vector import VectorEnv
 
 from sb3_abisim.common.cli import add_trust, make_parser, parse_pairs, parse_value, run
 from sb3_abisim.data.chains import ShardSource
+from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.environments import (
     N_BATCHED,
     N_COPIES,
@@ -28,6 +29,7 @@ from sb3_abisim.data.environments import (
     resolve_wrapper,
 )
 from sb3_abisim.data.format import CONFIG_NAME, TERMINATED, TRUNCATED, DatasetError, from_json_file
+from sb3_abisim.data.image_warning import warn_of_images
 from sb3_abisim.data.rollout import Policy
 from sb3_abisim.data.vectorized import is_vectorized
 from sb3_abisim.data.writer import check_folder, open_writer
@@ -105,14 +107,15 @@ def collect(
         _check_one_pass(folder, env_id, env_kwargs)
     elif n_envs is None:
         n_envs = there.get("n_envs")
-    as_made = False
+    as_made, reason = False, ""
     if isinstance(env_id, str):
         as_made, reason = as_made_or_reason(env_id, env_kwargs, preprocessing)
-        if progress and reason:
-            print(f"{env_id} steps as single environments, not as its vector environment: {reason}", file=sys.stderr)
     make_fn = functools.partial(make_vector_env, env_id, n_envs, env_kwargs, preprocessing, n_workers, as_made)
     one_pass = n_transitions if is_object else None
     source = ShardSource(make_fn, env_id, env_kwargs, seed, there, preprocessing, policy, one_pass)
+    # Not beside the error of an environment that cannot be collected from at all.
+    if progress and reason:
+        print(f"{env_id} steps as single environments, not as its vector environment: {reason}", file=sys.stderr)
     try:
         return _collect(source, n_transitions, folder, progress)
     finally:
@@ -174,6 +177,7 @@ def _collect(source: ShardSource, n_transitions: int, folder: Path, progress: bo
             "(--env-kwargs max_episode_steps:K)",
             stacklevel=3,
         )
+    warn_of_images(TransitionDataset(folder, verify=False), stacklevel=4)
     if progress:
         state = "already complete, nothing to do" if was_finished and not written else "complete"
         print(f"{folder}: {n_transitions} transitions of {source.identity['env_id']}, {state} (hash {hash[:16]})")

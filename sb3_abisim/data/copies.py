@@ -10,7 +10,7 @@ import multiprocessing
 import pickle
 import re
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
@@ -22,6 +22,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from sb3_abisim.common.images import fits
 from sb3_abisim.common.spaces import is_channels_first
 
 MakeFn = Callable[[], gym.Env[Any, Any]]
@@ -42,6 +43,7 @@ class ImageLayout:
     :param key: of a ``Dict`` observation; None for one that is an image
     :param factors: of a ``Dict`` observation, the keys that hold numbers, by the names of the factors that they become
     :param layouts: dtype and shape of one row of each factor
+    :param declared: the observation space
     """
 
     space: spaces.Box
@@ -49,6 +51,7 @@ class ImageLayout:
     key: str | None
     factors: dict[str, str]
     layouts: dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
+    declared: gym.Space[Any]
 
     @classmethod
     def of(cls, space: gym.Space[Any], image_key: str | None = None, remedy: str = _WRAPPERS) -> "ImageLayout":
@@ -61,6 +64,7 @@ class ImageLayout:
         """
         factors: dict[str, str] = {}
         layouts: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
+        declared = space
         if isinstance(space, spaces.Dict):
             images = [key for key, part in space.spaces.items() if _is_image(part)]
             if image_key is None and len(images) != 1:
@@ -98,7 +102,30 @@ class ImageLayout:
             channels, stored = NONE, (1, *shape)
         elif not is_channels_first(shape):
             channels, stored = LAST, (shape[2], *shape[:2])
-        return cls(spaces.Box(0, 255, stored, np.uint8), channels, image_key, factors, layouts)
+        return cls(spaces.Box(0, 255, stored, np.uint8), channels, image_key, factors, layouts, declared)
+
+    def require_declared(self, observation: Any, name: str) -> None:
+        """Refuse an observation that is not what the space declares.
+
+        Parts of a ``Dict`` that are neither image nor factor are not looked at.
+
+        :param observation: as the environment shows it
+        :param name: of the environment, for the message
+        :raises ValueError: for another dtype, shape or key, or numbers out of range, with both sides
+        """
+        space, where = self.declared, "observations"
+        if isinstance(space, spaces.Dict):
+            there = set(observation) if isinstance(observation, Mapping) else f"{type(observation).__name__}"
+            if there != set(space.spaces):
+                keys = sorted(there) if isinstance(there, set) else there
+                raise _undeclared(name, where, f"the keys {sorted(space.spaces)}", f"{keys}")
+            for key in self.factors.values():
+                _require_factor(observation[key], space.spaces[key], name, f"observations[{key!r}]")
+            assert self.key is not None
+            where, observation, space = f"observations[{self.key!r}]", observation[self.key], space.spaces[self.key]
+        image = np.asarray(observation)
+        if image.dtype != np.uint8 or image.shape != space.shape:
+            raise _undeclared(name, where, f"{space}", describe_array(image))
 
     def image(self, observation: Any) -> NDArray[np.uint8]:
         """The image of one observation, channels first, a copy.
@@ -146,6 +173,39 @@ class ImageLayout:
         return {name: np.zeros(shape, dtype) for name, (dtype, shape) in self.layouts.items()}
 
 
+def _require_factor(value: Any, space: gym.Space[Any], name: str, where: str) -> None:
+    array = np.asarray(value)
+    low: Any = 0
+    high: Any = 1
+    if isinstance(space, spaces.Box):
+        low, high = space.low, space.high
+    elif isinstance(space, spaces.Discrete):
+        low, high = space.start, space.start + space.n - 1
+    assert space.dtype is not None
+    if array.shape != tuple(space.shape or ()) or not fits(array, np.dtype(space.dtype), low, high):
+        raise _undeclared(name, where, f"{space}", describe_array(array))
+
+
+def describe_array(array: NDArray[Any]) -> str:
+    """Dtype, shape and range of an array, for messages.
+
+    :param array: of any dtype and shape
+    """
+    text = f"{array.dtype} {array.shape}"
+    if array.dtype.kind not in "biuf" or not array.size:
+        return text
+    if array.dtype.kind == "f" and np.isnan(array).any():
+        return f"{text} with NaN"
+    return f"{text} in {array.min():g}..{array.max():g}"
+
+
+def _undeclared(name: str, where: str, declared: str, returned: str) -> ValueError:
+    return ValueError(
+        f"{name} declares {where} as {declared}, but returned {returned}; make them what the observation space "
+        "declares, or correct the space"
+    )
+
+
 def factor_name(key: str) -> str:
     """The name of the factor that a key of observations becomes, of letters, digits and underscores.
 
@@ -171,7 +231,7 @@ class EnvCopies(VectorEnv[Any, Any, Any]):
         self.envs = [make_fn() for make_fn in make_fns]
         self.layout = ImageLayout.of(self.envs[0].observation_space, image_key)
         self._describe(len(self.envs), self.layout.space, self.envs[0].action_space)
-        self._rest = [self.layout.blank()] * self.num_envs
+        self._rest: Sequence[dict[str, NDArray[Any]]] = [self.layout.blank()] * self.num_envs
 
     def _describe(self, num_envs: int, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
         self.num_envs = num_envs
@@ -204,7 +264,7 @@ class EnvCopies(VectorEnv[Any, Any, Any]):
         for i, (env, action) in enumerate(zip(self.envs, actions, strict=True)):
             observation, rewards[i], terminated[i], truncated[i], _ = env.step(action)
             if terminated[i] or truncated[i]:
-                final_obs[i], final_rest[i] = self.layout.image(observation), self.layout.rest(observation)
+                final_obs[i], final_rest[i] = self._take(observation)
                 observation, _ = env.reset()
             shown.append(observation)
         factors = {name: [rest.get(name) for rest in final_rest] for name in self.layout.factors}
@@ -212,8 +272,18 @@ class EnvCopies(VectorEnv[Any, Any, Any]):
         return self._images(shown), rewards, terminated, truncated, infos
 
     def _images(self, shown: list[Any]) -> NDArray[np.uint8]:
-        self._rest = [self.layout.rest(observation) for observation in shown]
-        return np.stack([self.layout.image(observation) for observation in shown])
+        images, self._rest = zip(*map(self._take, shown), strict=True)
+        return np.stack(images)
+
+    def _take(self, observation: Any) -> tuple[NDArray[np.uint8], dict[str, NDArray[Any]]]:
+        """The image of one observation, and what else it holds."""
+        self.layout.require_declared(observation, self._name)
+        return self.layout.image(observation), self.layout.rest(observation)
+
+    @property
+    def _name(self) -> str:
+        spec = self.envs[0].spec
+        return type(self.envs[0].unwrapped).__name__ if spec is None else str(spec.id)
 
     def factors(self) -> dict[str, NDArray[Any]]:
         """What else the present observations hold: name to (n, ...); zeros before the first reset."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, TERMINATED, TRUNCATED
+from sb3_abisim.data.image_warning import warn_of_images
 from sb3_abisim.registry import Reader, get_reader
 
 # Keys of a dataset's ``source`` that the report reads. Readers write what they know.
@@ -39,6 +40,7 @@ def import_dataset(
     hash = record.read_fn(source, folder, **given)
     dataset = TransitionDataset(folder, eval_fraction=0.0, verify=False)
     _warn_without_ends(dataset)
+    warn_of_images(dataset)
     if verbose:
         print(import_report(folder))
     return hash

@@ -9,7 +9,7 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
 from sb3_abisim.common.spaces import sample_actions
-from sb3_abisim.data.copies import EnvCopies
+from sb3_abisim.data.copies import EnvCopies, describe_array
 from sb3_abisim.data.format import CUT, TERMINATED, TRUNCATED
 from sb3_abisim.data.writer import Segment
 from sb3_abisim.envs.base import BatchEnv
@@ -73,10 +73,23 @@ class Rollout:
         reset_seed, action_seed = seed.spawn(2)
         self._env, self._generator = env, np.random.default_rng(action_seed)
         self._observation, _ = env.reset(seed=reset_seed.generate_state(env.num_envs).tolist())
+        self._require_declared(self._observation, env.num_envs)
         self._policy = policy
         # Oldest first, zeros before an episode's first observation.
         self._stack = np.zeros((env.num_envs, frame_stack, *self._observation.shape[1:]), np.uint8)
         self._stack[:, -1] = self._observation
+
+    def _require_declared(self, observations: Any, n: int) -> None:
+        """Refuse batches that are not what they declare; copies look at each observation by themselves."""
+        space = self._env.single_observation_space
+        array = np.asarray(observations)
+        if array.dtype != np.uint8 or array.shape != (n, *(space.shape or ())):
+            spec = self._env.unwrapped.spec
+            name = type(self._env.unwrapped).__name__ if spec is None else spec.id
+            raise ValueError(
+                f"{name} declares observations as {space} of {n} copies, but returned "
+                f"{describe_array(array)}; make them what the observation space declares, or correct the space"
+            )
 
     def _choose(self, actions: NDArray[Any], by_policy: NDArray[np.bool_]) -> None:
         """Put the policy's actions in place of some random ones."""
@@ -103,6 +116,7 @@ class Rollout:
         """One step of every copy; how episodes ended, and infos."""
         self._choose(actions, by_policy)
         self._observation, _, terminated, truncated, infos = self._env.step(actions)
+        self._require_declared(self._observation, self._env.num_envs)
         if self._policy is not None:
             self._push(terminated | truncated)
         return terminated, truncated, infos
@@ -133,6 +147,8 @@ class Rollout:
             for j in np.flatnonzero((terminated | truncated) & (t < kept)):
                 last_factors = {name: infos["final_info"]["factors"][name][j] for name in factors[0]}
                 end = TERMINATED if terminated[j] else TRUNCATED
+                if not rendered:
+                    self._require_declared(np.asarray(infos["final_obs"][j])[None], 1)
                 endings[j].append((t + 1, end, infos["final_obs"][j], last_factors))
             advanced(int((t < kept).sum()))
         return _cut(observations, actions, factors, endings, kept)

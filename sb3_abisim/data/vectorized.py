@@ -85,10 +85,14 @@ class VectorizedCopies(EnvCopies):
                     f"{self._venv} ended an episode without infos['terminal_observation'], its last observation"
                 )
             last = rows[i]["terminal_observation"]
-            final_obs[i], final_rest[i] = self.layout.image(last), self.layout.rest(last)
+            final_obs[i], final_rest[i] = self._take(last)
         factors = {name: [rest.get(name) for rest in final_rest] for name in self.layout.factors}
         infos = {"final_obs": final_obs, "final_info": {"factors": factors}}
         return self._images(self._rows(observations)), rewards, dones & ~truncated, truncated, infos
+
+    @property
+    def _name(self) -> str:
+        return self.class_paths[-1] if self.spec is None else str(self.spec.id)
 
     def _rows(self, observations: Any) -> list[Any]:
         if isinstance(observations, dict):

@@ -7,7 +7,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 
 from sb3_abisim.common.malloc import keep_freed_memory
-from sb3_abisim.rl.checks import find_extractors, require_weights
+from sb3_abisim.rl.checks import check_eval_envs, find_extractors, require_weights
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
 
 
@@ -25,13 +25,15 @@ class EncoderCallback(BaseCallback):
     torch reuse memory (:mod:`sb3_abisim.common.malloc`).
 
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
-    :raises ValueError: when training starts, if the model was trained on the embeddings of another encoder
+    :raises ValueError: when training starts, if the model was trained on the embeddings of another encoder, or an
+        ``EvalCallback`` beside this one has another encoder or preprocessing
     :raises FloatingPointError: during training, for a number that is not finite
     """
 
     def _on_training_start(self) -> None:
         keep_freed_memory()
         require_weights(self.model)
+        check_eval_envs(self.training_env, self.locals.get("callback"))
         self._extractors = [extractor for _, extractor in find_extractors(self.model.policy)]
         for name, extractor in find_extractors(self.model.policy):
             origin = f"hash {extractor.hash}" if extractor.hash else "random weights"

@@ -3,12 +3,15 @@
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 from torch import nn
 
 from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.extractors import BaseEncoderExtractor, EncoderExtractor, PretrainedExtractor
+from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
 
 def find_extractors(policy: nn.Module) -> list[tuple[str, BaseEncoderExtractor]]:
@@ -54,6 +57,57 @@ def encoders_of(extractor: type, kwargs: Mapping[str, Any]) -> list[tuple[str, s
         networks = kwargs.get("networks") or {}
         return [(name, networks.get(key, {}).get("network")) for key, name in kwargs["encoders"].items()]
     return [] if kwargs.get("encoder") is None else [(kwargs["encoder"], kwargs.get("network"))]
+
+
+def check_eval_envs(training_env: VecEnv, callback: Any) -> None:
+    """Refuse evaluation environments whose observations were made in another way than those of training.
+
+    Compared are what ``VecEncodeObservations``, ``VecFrameStack``, ``VecNormalize`` and Gymnasium's wrappers of
+    observations do; of environments in other processes, the former only.
+
+    :param training_env: of the model
+    :param callback: of ``learn``; those within it are looked at, too
+    :raises ValueError: with both sides
+    """
+    for child in getattr(callback, "callbacks", None) or [getattr(callback, "callback", None)]:
+        if child is not None:
+            check_eval_envs(training_env, child)
+    eval_env = getattr(callback, "eval_env", None)
+    if not isinstance(eval_env, VecEnv):
+        return
+    (layers, wrappers), (their_layers, their_wrappers) = _preprocessing(training_env), _preprocessing(eval_env)
+    differ = wrappers is not None and their_wrappers is not None and wrappers != their_wrappers
+    if layers != their_layers or differ:
+        here, there = (
+            ", ".join([*names, *(inner or [])]) or "nothing"
+            for names, inner in ((layers, wrappers), (their_layers, their_wrappers))
+        )
+        raise ValueError(
+            f"{type(callback).__name__} evaluates on observations made by {there}, but training makes them by {here}; "
+            "give its eval_env the same encoder file and wrappers"
+        )
+
+
+def _preprocessing(venv: VecEnv) -> tuple[list[str], list[str] | None]:
+    """What makes the observations of an environment, the outermost first: in the VecEnv, and in its first copy."""
+    layers: list[str] = []
+    while isinstance(venv, VecEnvWrapper):
+        if isinstance(venv, VecEncodeObservations):
+            layers.append(f"VecEncodeObservations(hash {venv.encoder_file.hash})")
+        elif isinstance(venv, VecFrameStack):
+            layers.append(f"VecFrameStack({venv.stacked_obs.n_stack})")
+        elif isinstance(venv, VecNormalize) and venv.norm_obs:
+            layers.append("VecNormalize")
+        venv = venv.venv
+    copies = getattr(venv, "envs", None)
+    if not copies:
+        return layers, None
+    wrappers, env = [], copies[0]
+    while isinstance(env, gym.Wrapper):
+        if isinstance(env, gym.ObservationWrapper):
+            wrappers.append(f"{type(env).__module__}.{type(env).__qualname__}")
+        env = env.env
+    return layers, wrappers
 
 
 def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> None:

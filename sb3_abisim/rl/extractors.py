@@ -13,6 +13,8 @@ What SB3 does to any extractor with its default settings, and where that is stop
   ``weights_ready`` says whether weights have come since.
 """
 
+import math
+import warnings
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -22,6 +24,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
+from sb3_abisim.common.images import ImageCheck
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.rl.file_network import build_network, check_objective, read_network
@@ -49,6 +52,7 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
         self._weight_names = [name for name, _ in encoder.named_parameters()]
         self.register_buffer("initial_weights", self._flat_weights().clone())
         self._input_checked = False
+        self._image_check = ImageCheck()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)  # type: ignore[no-untyped-call]
@@ -76,25 +80,53 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
 
         :param observations: float (batch, channels, height, width) in 0..1, as SB3 preprocesses images
         :return: the encoder's embedding, float (batch, features_dim)
-        :raises ValueError: if the first observations that arrive are not in 0..1
+        :raises ValueError: if observations are not in 0..1 or embeddings not finite
         """
+        # Numbers are not known then.
+        knows_numbers = not (th.compiler.is_exporting() or th.compiler.is_compiling())
         if not self._input_checked:
             self._check_input(observations)
+        # Agents act without gradients. What they have seen is of the space's dtype when it is learned from.
+        if knows_numbers and not (self._input_checked and th.is_grad_enabled()):
+            self._require_range(observations)
         features: th.Tensor = self.encoder(observations)
+        # One sum shows whether a number is not finite.
+        if knows_numbers and not math.isfinite(float(features.detach().sum())):
+            self._require_range(observations)
+            if not bool(th.isfinite(features).all()):
+                raise ValueError(
+                    f"embeddings of {self._label} are NaN or infinite, though observations are in 0..1: its "
+                    "weights are, or are far too large; lower the learning rate, or look for NaN in rewards"
+                )
         return features
 
-    def _check_input(self, observations: th.Tensor) -> None:
-        # Numbers are not known then.
-        if th.compiler.is_exporting():
+    @property
+    def _label(self) -> str:
+        return f"{type(self).__name__} ({self.source})"
+
+    def _require_range(self, observations: th.Tensor) -> None:
+        if not observations.numel():
             return
-        largest = float(observations.max()) if observations.numel() else 0.0
-        if largest > 1.0:
-            raise ValueError(
-                f"observations reach {largest:g}, but encoders take images in 0..1; "
-                "remove normalize_images=False from policy_kwargs"
-            )
+        low, high = (float(bound) for bound in observations.detach().aminmax())
+        if low >= 0.0 and high <= 1.0:
+            return
+        remedy = (
+            "the environment returned NaN or infinity; correct it"
+            if not (math.isfinite(low) and math.isfinite(high))
+            else "remove normalize_images=False from policy_kwargs, or correct the environment's observations"
+        )
+        extent = f"{high:g}" if low >= 0.0 else f"{low:g}..{high:g}"
+        raise ValueError(f"observations reach {extent}, but {self._label} takes images in 0..1; {remedy}")
+
+    def _check_input(self, observations: th.Tensor) -> None:
+        if th.compiler.is_exporting() or th.compiler.is_compiling():
+            return
+        self._require_range(observations)
+        self._image_check.add((observations.detach() * 255).round().to(th.uint8).cpu().numpy())
+        if problem := self._image_check.problem():
+            warnings.warn(f"{self._label}: {problem}", stacklevel=2)
         # A black observation proves nothing.
-        self._input_checked = largest > 0.0
+        self._input_checked = self._image_check.is_settled or problem is not None
 
     def _flat_weights(self) -> th.Tensor:
         weights = self.encoder.state_dict()
@@ -251,7 +283,7 @@ class PretrainedExtractor(BaseEncoderExtractor):
             )
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         # The loaded model may be one that never had its weights.
-        self._input_checked = False
+        self._input_checked, self._image_check = False, ImageCheck()
         self._has_weights = bool(self.weights_ready)
 
 

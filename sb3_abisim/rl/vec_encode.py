@@ -5,6 +5,8 @@ embedded once, when the environment returns it, and rollouts, replay buffers and
 ``merge_encoder`` makes the trained model into one that acts on image observations.
 """
 
+import warnings
+
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -14,6 +16,7 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecTransposeImage
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_abisim.common.images import ImageCheck
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import embed, load_encoder
 from sb3_abisim.rl.file_network import check_objective
@@ -79,6 +82,7 @@ class VecEncodeObservations(VecEnvWrapper):
         super().__init__(venv, observation_space=EncodedBox(file.encoder.features_dim, file.hash))
         self.encoder_file = file
         self.source = encoder
+        self._input_checked, self._image_check = False, ImageCheck()
         self._device = get_device(device)
         self._encoder: Encoder = file.encoder.to(self._device).requires_grad_(False)
 
@@ -92,7 +96,19 @@ class VecEncodeObservations(VecEnvWrapper):
 
         :param observations: uint8 (batch, channels, height, width)
         :return: float32 (batch, features_dim)
+        :raises ValueError: for observations of another dtype or shape, which may hold NaN or numbers out of range
         """
+        space = self.venv.observation_space
+        if observations.dtype != np.uint8 or observations.shape[1:] != space.shape:
+            raise ValueError(
+                f"VecEncodeObservations ({self.source}) got observations {observations.dtype} {observations.shape[1:]} "
+                f"from an environment that declares {space}; make them what it declares"
+            )
+        if not self._input_checked:
+            self._image_check.add(observations)
+            if problem := self._image_check.problem():
+                warnings.warn(f"VecEncodeObservations ({self.source}): {problem}", stacklevel=3)
+            self._input_checked = self._image_check.is_settled or problem is not None
         tensor = th.from_numpy(observations).to(self._device)
         embeddings: NDArray[np.float32] = embed(self._encoder, self.venv.observation_space, tensor).cpu().numpy()
         return embeddings

@@ -339,7 +339,7 @@ def test_arguments_reach_the_environment_and_the_manifest(tmp_path: Path) -> Non
         ({"--n-envs": "0"}, "n_envs must be at least 1, got 0"),
         ({"--seed": "-1"}, "seed must be at least 0, got -1"),
         ({"--env-kwargs": "offset=3"}, "--env-kwargs takes NAME:VALUE"),
-        ({"--env-kwargs": "nonsense:3"}, "cannot make IndexEnv-v0 with {'nonsense': 3}"),
+        ({"--env-kwargs": "nonsense:3"}, "IndexVectorEnv takes no argument 'nonsense'"),
         ({"--packages": "no_such_module"}, "cannot import 'no_such_module'"),
         ({"--env": "CartPole-v1"}, "uint8 images"),
         ({"--env-kwargs": "offset:{1,2}"}, "env_kwargs and env_wrapper must be what JSON can hold"),

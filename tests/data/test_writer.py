@@ -121,5 +121,7 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path: Path) -> None:
 def test_a_damaged_import_names_its_source(tmp_path: Path) -> None:
     write(tmp_path / "d", [segment(4)])
     (tmp_path / "d" / "frames-00000.npy").unlink()
-    with pytest.raises(ValueError, match=r"frames-00000\.npy is missing; remove .* import it again .*\['disk', 3\]"):
+    with pytest.raises(
+        ValueError, match=r"frames-00000\.npy is missing; remove .* make it again from its source, \['disk', 3\]"
+    ):
         TransitionDataset(tmp_path / "d")

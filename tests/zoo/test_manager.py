@@ -18,11 +18,12 @@ from zoo_inputs import SMALL, write_encoder
 
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.envs import ENV_IDS
-from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.checks import check_trained_with
 from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.extractors import VanillaExtractor
+from sb3_abisim.rl.file_network import network_arguments
 from sb3_abisim.zoo.manager import MethodExperimentManager, install, with_eval_split
 from sb3_abisim.zoo.methods import ENCODING_WRAPPER, MethodRecord, encoding_kwargs, read_entries
 from sb3_abisim.zoo.runs import read_run
@@ -61,6 +62,14 @@ def effective(manager: Any) -> dict[str, Any]:
 # Methods.
 
 
+def with_network(encoder: str) -> dict[str, Any]:
+    """The extractor's arguments for a shipped encoder, or one that does not ship."""
+    try:
+        return {"encoder": encoder, **network_arguments(load_encoder(encoder))}
+    except EncoderNotFoundError:
+        return {"encoder": encoder}
+
+
 @pytest.mark.parametrize(("algo", "env_id"), ENTRIES)
 def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: str) -> None:
     default = effective(manager(algo, env_id))
@@ -70,7 +79,7 @@ def test_methods_differ_in_policy_kwargs_alone(manager: Any, algo: str, env_id: 
     for word, class_name, expected in [
         ("abisim", "ActionBisimExtractor", {"encoder": shipped}),
         *(
-            (name, get_method(name).extractor, {"encoder": shipped.replace("/abisim", f"/{name}")})
+            (name, get_method(name).extractor, with_network(shipped.replace("/abisim", f"/{name}")))
             for name in PRETRAINED
         ),
         ("ssi=my runs/x.safetensors", "SSIExtractor", {"encoder": "my runs/x.safetensors"}),

@@ -7,6 +7,7 @@ again, and a changed one is not mistaken for the old one.
 import hashlib
 import json
 import os
+import sys
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -19,12 +20,13 @@ from numpy.typing import NDArray
 from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.envs.backgrounds.clips import FRAME_SHAPE, SIZE, Backgrounds, Clip, array_hash
-from sb3_abisim.envs.backgrounds.video_files import Source
-from sb3_abisim.envs.backgrounds.video_frames import ClipError, decode_clip, expected_frames
+from sb3_abisim.envs.backgrounds.video_files import Source, describe_split
+from sb3_abisim.envs.backgrounds.video_frames import decode_clip, expected_frames
+from sb3_abisim.envs.backgrounds.video_whole import ClipError
 
 _BYTES_PER_FRAME = 3 * SIZE * SIZE
 # Raise it when the decoding changes, so that older cache entries are not used.
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 
 
 def _make_cache(folder: Path) -> None:
@@ -141,6 +143,9 @@ def load_split(
             raise ValueError(f"{twin.path} (train) and {source.path} (eval) have the same content; remove one of them")
     entries = [_Entry(source, hashes[source]) for source in (train_sources if split == "train" else eval_sources)]
     found = {entry: entry.read() for entry in entries}
+    if not all(found.values()):
+        # Once, before they are decoded.
+        print(describe_split(origin, {"train": train_sources, "eval": eval_sources}), file=sys.stderr)
     max_frames = max_bytes // _BYTES_PER_FRAME
     expected = sum(clip.length if clip else expected_frames(entry.source) for entry, clip in found.items())
     if expected > max_frames:

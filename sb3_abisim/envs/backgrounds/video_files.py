@@ -5,15 +5,24 @@ A folder may hold video files and folders of frames at any depth, or be a DAVIS 
 
 import os
 import re
+import warnings
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sb3_abisim.envs.backgrounds.clips import SPLITS, split_groups
+from sb3_abisim.envs.backgrounds.video_roles import (
+    CONTAINER_FOLDERS,
+    IMAGE_SUFFIXES,
+    SIDECAR_SUFFIXES,
+    VIDEO_SUFFIXES,
+    is_other_role,
+    require_images,
+    require_one_series,
+)
+from sb3_abisim.envs.backgrounds.video_whole import is_animated_webp
 
-VIDEO_SUFFIXES = (".avi", ".gif", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ogv", ".webm")
-IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".webp")
 # yt-dlp writes "title [id].mp4", Kinetics "id_000010_000020.mp4".
 _YOUTUBE_ID = re.compile(r"\[([\w-]{11})\]|^([\w-]{11})_\d{6}_\d{6}$")
 # A split that the folder defines, in any case of letters.
@@ -21,6 +30,10 @@ TRAIN_FOLDERS = ("train", "training")
 EVAL_FOLDERS = ("eval", "evaluation", "val", "valid", "validation", "test", "testing")
 # Of each video beside them; more images are frames.
 MAX_THUMBNAILS = 4
+# Where the images of DAVIS lie, the smaller ones first.
+_DAVIS_SIZES = ("480p", "Full-Resolution")
+# Names in a warning.
+_MAX_NAMED = 12
 _DAVIS_LISTS = {"train": "train.txt", "eval": "val.txt"}
 
 
@@ -58,69 +71,145 @@ def natural_key(name: str) -> list[Any]:
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split("([0-9]+)", name))]
 
 
+@dataclass
+class Found:
+    """What is in a folder of videos.
+
+    :param sources: the clips
+    :param left_out: paths that are no clips, with the reason
+    """
+
+    sources: list[Source] = field(default_factory=list)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+    def leave_out(self, path: Path, root: Path, why: str) -> None:
+        """Note a path that is no clip, by its name within ``root``."""
+        self.left_out[path.relative_to(root).as_posix()] = why
+
+
 def find_sources(root: Path) -> tuple[Source, ...]:
     """All clips in a folder, sorted by name.
 
     ``root/train`` and ``root/eval`` (:data:`TRAIN_FOLDERS` and :data:`EVAL_FOLDERS`), where both exist, are taken as
     the split. Links to folders are followed. Hidden files are left out, and so are images beside video files (their
-    thumbnails).
+    thumbnails). Masks and depth (:data:`OTHER_ROLES`), kinds of files that are not read, and what is no file are left
+    out with a warning that names them.
 
     :param root: the folder
-    :raises ValueError: for a folder that is missing, not a folder, without videos, or with frames beside video files
+    :raises ValueError: for a folder that is missing, not a folder, without videos, with frames beside video files, or
+        with images that may be masks
+    """
+    found = explore(root)
+    if not found.sources:
+        lines = "; ".join(f"{name}: {why}" for name, why in list(found.left_out.items())[:5])
+        raise ValueError(
+            f"no videos in {root}, found {_count_suffixes(root)}{f' ({lines})' if lines else ''}; put video files "
+            f"({' '.join(VIDEO_SUFFIXES)}) or folders of frames ({' '.join(IMAGE_SUFFIXES)}) there"
+        )
+    if found.left_out:
+        lines = "; ".join(f"{name} ({why})" for name, why in list(found.left_out.items())[:_MAX_NAMED])
+        more = f" and {len(found.left_out) - _MAX_NAMED} more" * (len(found.left_out) > _MAX_NAMED)
+        warnings.warn(f"left out of {len(found.sources)} clips in {root}: {lines}{more}", stacklevel=3)
+    return tuple(sorted(found.sources, key=lambda source: natural_key(source.name)))
+
+
+def explore(root: Path) -> Found:
+    """The clips in a folder, and what was left out.
+
+    :param root: the folder
+    :raises ValueError: see :func:`find_sources`
     """
     if not root.exists():
         raise ValueError(f"the folder of videos {root} does not exist (from {Path.cwd()}); correct the path")
     if not root.is_dir():
         raise ValueError(f"{root} is a file; give the folder with your videos, at least two, one for each of {SPLITS}")
-    if (root / "JPEGImages" / "480p").is_dir():
-        return _find_davis(root)
+    davis = [folder for name in _DAVIS_SIZES if (folder := root / "JPEGImages" / name).is_dir()]
+    if davis and (len(davis) > 1 or (root / "ImageSets").is_dir() or davis[0].name == _DAVIS_SIZES[0]):
+        return _find_davis(root, davis[0])
+    found = Found()
+    children = sorted(root.iterdir())
     sides = {
-        side: [folder for folder in sorted(root.iterdir()) if folder.name.lower() in names and folder.is_dir()]
+        side: [folder for folder in children if folder.name.lower() in names and folder.is_dir()]
         for side, names in (("train", TRAIN_FOLDERS), ("eval", EVAL_FOLDERS))
     }
     if sides["train"] and sides["eval"]:
-        sources = [source for side, folders in sides.items() for folder in folders for source in _find(folder, side)]
+        for side, folders in sides.items():
+            for folder in folders:
+                _find(folder, side, root, found)
+        for child in children:
+            is_clip = not child.name.startswith(".") and (child.is_dir() or _is_medium(child.name))
+            if is_clip and child not in sides["train"] + sides["eval"]:
+                found.leave_out(child, root, "beside the folders of the two sides")
     else:
-        sources = _find(root, None)
-    if not sources:
-        suffixes = Counter(file.suffix.lower() or "no suffix" for file in root.rglob("*") if file.is_file())
-        found = ", ".join(f"{n} x {suffix}" for suffix, n in suffixes.most_common(5)) or "an empty folder"
-        raise ValueError(
-            f"no videos in {root}, found {found}; put video files ({' '.join(VIDEO_SUFFIXES)}) "
-            f"or folders of frames ({' '.join(IMAGE_SUFFIXES)}) there"
-        )
-    return tuple(sorted(sources, key=lambda source: natural_key(source.name)))
+        _find(root, None, root, found)
+    require_images(found.sources)
+    return found
 
 
-def _find(root: Path, split: str | None) -> list[Source]:
+def _is_medium(name: str) -> bool:
+    return not name.lower().endswith(SIDECAR_SUFFIXES) and "." in name
+
+
+def _count_suffixes(root: Path) -> str:
+    suffixes: Counter[str] = Counter()
+    for _, _, names in os.walk(root):
+        suffixes.update(Path(name).suffix.lower() or "no suffix" for name in names)
+    return ", ".join(f"{n} x {suffix}" for suffix, n in suffixes.most_common(5)) or "an empty folder"
+
+
+def _find(root: Path, split: str | None, top: Path, found: Found) -> None:
     prefix = f"{root.name}/" if split else ""
-    sources = []
     seen = {root.resolve()}
     for folder, subfolders, names in os.walk(root, followlinks=True):
+        here = Path(folder)
         subfolders[:] = [name for name in sorted(subfolders) if not name.startswith(".")]
+        for name in subfolders:
+            if is_other_role(name, subfolders):
+                found.leave_out(here / name, top, "masks, depth or the like by its name")
+        subfolders[:] = [name for name in subfolders if not is_other_role(name, subfolders)]
         # Links may lead back.
-        places = {name: (Path(folder) / name).resolve() for name in subfolders}
+        places = {name: (here / name).resolve() for name in subfolders}
         subfolders[:] = [name for name, place in places.items() if place not in seen]
         seen |= set(places.values())
         visible = sorted((name for name in names if not name.startswith(".")), key=natural_key)
-        here = Path(folder)
-        videos = [here / name for name in visible if name.lower().endswith(VIDEO_SUFFIXES)]
-        images = [here / name for name in visible if name.lower().endswith(IMAGE_SUFFIXES)]
-        clips = [(video, [video]) for video in videos]
-        if videos and len(images) > MAX_THUMBNAILS * len(videos):
-            raise ValueError(
-                f"{here} holds {len(images)} images beside {videos[0].name}: frames or thumbnails? "
-                "Move the images or the video to another folder"
-            )
-        if images and not videos:
-            clips.append((here, images))
-        for path, files in clips:
+        for path, files in _clips_in(here, visible, top, found):
             relative = path.relative_to(root)
             parts = relative.parts or (root.name,)
             youtube = _YOUTUBE_ID.search(relative.stem)
-            group = (youtube[1] or youtube[2]) if youtube else prefix + parts[0]
-            sources.append(_source(prefix + "/".join(parts), group, path, tuple(files), split))
-    return sources
+            # The first that says which clip it is, not that images lie there.
+            own = [part for part in parts if part.lower() not in CONTAINER_FOLDERS] or [parts[-1]]
+            group = (youtube[1] or youtube[2]) if youtube else prefix + own[0]
+            found.sources.append(_source(prefix + "/".join(parts), group, path, tuple(files), split))
+
+
+def _clips_in(here: Path, names: list[str], top: Path, found: Found) -> list[tuple[Path, list[Path]]]:
+    """The clips that lie in a folder itself: its videos, or all its images as one."""
+    videos, images = [], []
+    stems = [Path(name).stem for name in names]
+    for name in names:
+        path, is_animated = here / name, name.lower().endswith(".webp")
+        known = name.lower().endswith(VIDEO_SUFFIXES + IMAGE_SUFFIXES)
+        # A pipe would be waited for without end.
+        if known and not path.is_file():
+            found.leave_out(path, top, "no regular file, or a link to nothing")
+        elif name.lower().endswith(VIDEO_SUFFIXES) or (is_animated and is_animated_webp(path)):
+            if is_other_role(Path(name).stem, stems, alone=False):
+                found.leave_out(path, top, "masks, depth or the like by its name")
+            else:
+                videos.append(path)
+        elif known:
+            images.append(path)
+        elif _is_medium(name):
+            found.leave_out(path, top, "of a kind that is not read")
+    if videos and len(images) > MAX_THUMBNAILS * len(videos):
+        raise ValueError(
+            f"{here} holds {len(images)} images beside {videos[0].name}: frames or thumbnails? "
+            "Move the images or the video to another folder"
+        )
+    if images and not videos:
+        require_one_series(here, images)
+        return [(here, images)]
+    return [(video, [video]) for video in videos]
 
 
 def _source(name: str, group: str, path: Path, files: tuple[Path, ...], split: str | None) -> Source:
@@ -128,8 +217,8 @@ def _source(name: str, group: str, path: Path, files: tuple[Path, ...], split: s
     return Source(name, group, path, files, tuple((stat.st_size, stat.st_mtime_ns) for stat in stats), split)
 
 
-def _find_davis(root: Path) -> tuple[Source, ...]:
-    frames, sources = root / "JPEGImages" / "480p", []
+def _find_davis(root: Path, frames: Path) -> Found:
+    found = Found()
     for split, list_name in _DAVIS_LISTS.items():
         path = root / "ImageSets" / "2017" / list_name
         if not path.is_file():
@@ -140,8 +229,22 @@ def _find_davis(root: Path) -> tuple[Source, ...]:
             files = sorted((frames / name).glob("*.jpg"), key=lambda file: natural_key(file.name))
             if not files:
                 raise ValueError(f"{path} lists {name!r} but {frames / name} has no *.jpg; unpack it or edit the list")
-            sources.append(_source(name, name, frames / name, tuple(files), split))
-    return tuple(sources)
+            found.sources.append(_source(name, name, frames / name, tuple(files), split))
+    return found
+
+
+def describe_split(origin: str, chosen: dict[str, tuple[Source, ...]]) -> str:
+    """Which clips are on which side, a line each.
+
+    :param origin: the folder
+    :param chosen: of :func:`split_sources`
+    """
+    lines = [
+        f"  {side:5}  {source.name} ({'video' if source.is_video else f'{len(source.files)} frames'})"
+        for side, sources in chosen.items()
+        for source in sources
+    ]
+    return "\n".join([f"clips in {origin}:", *lines])
 
 
 def split_sources(sources: tuple[Source, ...], seed: int, eval_fraction: float) -> dict[str, tuple[Source, ...]]:

@@ -5,9 +5,11 @@ therefore compared with what the file's header or the numbers of the frames prom
 trimmed counts frames that are not shown; it is complete if its last frame ends when the header promises.
 """
 
+import contextlib
 import importlib
 import itertools
 import re
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,19 +19,41 @@ from numpy.typing import NDArray
 
 from sb3_abisim.envs.backgrounds.clips import SIZE
 from sb3_abisim.envs.backgrounds.video_files import Source
+from sb3_abisim.envs.backgrounds.video_whole import ClipError, require_whole
 
 if TYPE_CHECKING:
     from PIL import Image
 
 
-class ClipError(ValueError):
-    """One clip cannot be used; ``on_error="skip"`` leaves it out."""
+# What is opened is a file of these formats: no playlist and no list of files, which may name others or the network.
+_OPTIONS = {"protocol_whitelist": "none", "format_whitelist": "mov,matroska,avi,gif,ogg,mpeg,mpegvideo"}
+# From the display matrix, of which a row says where an axis goes, to Pillow's transposition.
+_TRANSPOSITIONS = {
+    (1, 0, 0, 1): None,
+    (-1, 0, 0, 1): "FLIP_LEFT_RIGHT",
+    (1, 0, 0, -1): "FLIP_TOP_BOTTOM",
+    (-1, 0, 0, -1): "ROTATE_180",
+    (0, 1, -1, 0): "ROTATE_270",
+    (0, -1, 1, 0): "ROTATE_90",
+    (0, 1, 1, 0): "TRANSPOSE",
+    (0, -1, -1, 0): "TRANSVERSE",
+}
 
 
-def decode_video(path: Path) -> Iterator["Image.Image"]:
-    """The frames of a video file.
+@contextlib.contextmanager
+def _open(path: Path) -> Iterator[Any]:
+    """A container. It is given an open file: a name such as ``http:a.mp4`` would be taken for an address."""
+    # Titles and the like may be in any encoding.
+    av = _import_decoder("av")
+    with path.open("rb") as file, av.open(file, options=dict(_OPTIONS), metadata_errors="ignore") as container:
+        yield container
+
+
+def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
+    """The frames of a video file as its header says that they are shown, each with the aspect of its pixels.
 
     :param path: the file
+    :return: the frames, turned and mirrored, and the width of a pixel over its height
     :raises ClipError: if it cannot be decoded or has fewer frames than its header promises (so does a complete Matroska
         file whose frame rate varies)
     :raises ImportError: if the decoder is not installed
@@ -37,15 +61,22 @@ def decode_video(path: Path) -> Iterator["Image.Image"]:
     av = _import_decoder("av")
     count, end, length = 0, 0.0, None
     try:
-        # Titles and the like may be in any encoding.
-        with av.open(str(path), metadata_errors="ignore") as container:
+        is_whole = require_whole(path)
+        with _open(path) as container:
+            stream = _video_stream(container, path)
             promised, share = _promise(container, path)
-            length = _mp4_length(container)
-            container.streams.video[0].thread_type = "AUTO"
-            for frame in container.decode(video=0):
+            if promised is None and not is_whole:
+                raise ClipError(
+                    f"{path} does not say how long it is, so that a cut-off copy would look the same; write it anew: "
+                    f"ffmpeg -i {path.name} -c copy whole{path.suffix}"
+                )
+            length = _mp4_length(container, stream)
+            aspect = float(stream.sample_aspect_ratio or 1)
+            stream.thread_type = "AUTO"
+            for frame in container.decode(stream):
                 if frame.is_corrupt:
                     raise ClipError(f"frame {count} of {path} is damaged; replace the file or remove it")
-                yield frame.to_image()
+                yield _upright(frame, aspect, path)
                 count += 1
                 if length is not None and frame.pts is not None:
                     end = float((frame.pts + frame.duration) * frame.time_base)
@@ -53,7 +84,7 @@ def decode_video(path: Path) -> Iterator["Image.Image"]:
         raise ClipError(
             f"{path} cannot be decoded after {count} frames ({error}); replace the file or remove it"
         ) from error
-    complete = length is not None and end >= share * length
+    complete = is_whole or (length is not None and end >= share * length)
     if promised is not None and count < share * promised and not complete:
         raise ClipError(
             f"decoded {count} of {promised} frames of {path}: the file is cut off, or its frames are not evenly timed; "
@@ -61,11 +92,37 @@ def decode_video(path: Path) -> Iterator["Image.Image"]:
         )
 
 
+def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", float]:
+    """A frame as it is shown, and the aspect of its pixels then."""
+    image = frame.to_image()
+    matrix = next((data for data in frame.side_data if data.type.name == "DISPLAYMATRIX"), None)
+    if matrix is None:
+        return image, aspect
+    # Fixed-point numbers: x to (a, b), y to (c, d).
+    a, b, _, c, d, *_ = struct.unpack("9i", bytes(matrix))
+    largest = max(map(abs, (a, b, c, d))) or 1
+    rows = tuple(round(value / largest, 2) for value in (a, b, c, d))
+    if rows not in _TRANSPOSITIONS:
+        raise ClipError(f"{path} is to be shown turned by no right angle, or skewed; turn it before, or remove it")
+    name = _TRANSPOSITIONS[rows]
+    if name is None:
+        return image, aspect
+    turned = image.transpose(_import_decoder("PIL.Image").Transpose[name])
+    return turned, aspect if rows[0] else 1 / aspect
+
+
+def _video_stream(container: Any, path: Path) -> Any:
+    """The video, which is no cover image."""
+    cover = _import_decoder("av.stream").Disposition.attached_pic
+    streams = [stream for stream in container.streams.video if not stream.disposition & cover]
+    if not streams:
+        raise ClipError(f"{path} holds no video{' but a cover' * bool(container.streams.video)}; remove it")
+    return streams[0]
+
+
 def _promise(container: Any, path: Path) -> tuple[int | None, float]:
     """How many frames the header promises, and the share of them that must come."""
-    if not container.streams.video:
-        raise ClipError(f"{path} holds no video; remove it")
-    stream = container.streams.video[0]
+    stream = _video_stream(container, path)
     if stream.frames:
         return int(stream.frames), 0.98
     rate = stream.average_rate
@@ -79,13 +136,12 @@ def _promise(container: Any, path: Path) -> tuple[int | None, float]:
     return None, 0.0
 
 
-def _mp4_length(container: Any) -> float | None:
+def _mp4_length(container: Any, stream: Any) -> float | None:
     """When an MP4 or MOV file's last frame ends, in seconds.
 
     None for other formats: what is left of an AVI file gives its remaining length, and Matroska steps over damage, so
     that a lost piece looks like a still image.
     """
-    stream = container.streams.video[0]
     if "mp4" not in container.format.name or stream.duration is None:
         return None
     return float(((stream.start_time or 0) + stream.duration) * stream.time_base)
@@ -98,7 +154,11 @@ def decode_clip(source: Source) -> Iterator[NDArray[np.uint8]]:
     :raises ClipError: if it cannot be decoded or lacks frames
     :raises ImportError: if the decoder is not installed
     """
-    return map(shrink, decode_video(source.path) if source.is_video else _decode_images(source))
+    if not source.is_video:
+        return map(shrink, _decode_images(source))
+    if source.path.suffix.lower() == ".webp":
+        return map(shrink, _decode_webp(source.path))
+    return itertools.starmap(shrink, decode_video(source.path))
 
 
 def expected_frames(source: Source) -> int:
@@ -108,9 +168,11 @@ def expected_frames(source: Source) -> int:
     """
     if not source.is_video:
         return len(source.files)
+    if source.path.suffix.lower() == ".webp":
+        return 0
     av = _import_decoder("av")
     try:
-        with av.open(str(source.path), metadata_errors="ignore") as container:
+        with _open(source.path) as container:
             return _promise(container, source.path)[0] or 0
     except (ClipError, av.FFmpegError):
         return 0  # decoding will report what is wrong
@@ -118,6 +180,7 @@ def expected_frames(source: Source) -> int:
 
 def _decode_images(source: Source) -> Iterator["Image.Image"]:
     image_module = _import_decoder("PIL.Image")
+    ops = _import_decoder("PIL.ImageOps")
     _check_numbers(source)
     for file in source.files:
         try:
@@ -126,9 +189,24 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
                     raise ClipError(
                         f"{file} has more than 8 bits per value ({image.mode}); convert {source.path} to 8 bits"
                     )
-                yield image.convert("RGB")
+                if getattr(image, "n_frames", 1) > 1:
+                    raise ClipError(f"{file} holds several frames; make it a video, or remove {source.path}")
+                yield ops.exif_transpose(image).convert("RGB")
         except (OSError, SyntaxError, image_module.DecompressionBombError) as error:
             raise ClipError(f"{file} cannot be decoded ({error}); replace the file or remove {source.path}") from error
+
+
+def _decode_webp(path: Path) -> Iterator["Image.Image"]:
+    """The images of an animated WebP."""
+    image_module = _import_decoder("PIL.Image")
+    require_whole(path)
+    try:
+        with image_module.open(path) as image:
+            for index in range(image.n_frames):
+                image.seek(index)
+                yield image.convert("RGB")
+    except (OSError, EOFError, SyntaxError, image_module.DecompressionBombError) as error:
+        raise ClipError(f"{path} cannot be decoded ({error}); replace the file or remove it") from error
 
 
 def _check_numbers(source: Source) -> None:
@@ -147,15 +225,20 @@ def _check_numbers(source: Source) -> None:
         )
 
 
-def shrink(image: "Image.Image") -> NDArray[np.uint8]:
+def shrink(image: "Image.Image", aspect: float = 1.0) -> NDArray[np.uint8]:
     """The central square of a frame, averaged to uint8 (3, 64, 64).
 
     :param image: of any size and mode
+    :param aspect: width of a pixel over its height
     """
     box = _import_decoder("PIL.Image").Resampling.BOX
-    side = min(image.size)
-    left, top = (image.width - side) // 2, (image.height - side) // 2
-    small = image.convert("RGB").resize((SIZE, SIZE), box, box=(left, top, left + side, top + side))
+    # Of the square as it is shown, in units of the height of a pixel.
+    side = min(image.width * aspect, image.height)
+    left, top = (image.width - side / aspect) / 2, (image.height - side) / 2
+    if aspect == 1:
+        left, top = int(left), int(top)  # whole pixels
+    region = (left, top, left + side / aspect, top + side)
+    small = image.convert("RGB").resize((SIZE, SIZE), box, box=region)
     return np.ascontiguousarray(np.asarray(small).transpose(2, 0, 1))
 
 

