@@ -133,8 +133,9 @@ def test_a_network_is_named_by_its_import_path(package: Path, tmp_path: Path) ->
             refused = run(package, tmp_path, "train", *flag, *words, "--conf-file", spec, code=2)
             assert f"--packages {name}" in refused
         run(package, tmp_path, "train", *flag, name, *words, "--conf-file", spec)
-    # Of the first one, policy_kwargs in config.yml say which network it is; that file alone has nothing imported, either.
-    enjoy = ["enjoy", "--packages", "my_package", name, "--algo", "ppo", *env, "-f", "logs", "--no-render", "-n", "9"]
+    # Of the first one, config.yml says which network it is; that file alone has nothing imported, either.
+    enjoy = ["enjoy", "--packages", "my_package", name, "--algo", "ppo", *env]
+    enjoy += ["-f", "logs", "--no-render", "-n", "9"]
     run(package, tmp_path, *enjoy, "--exp-id", "1")
 
 
