@@ -145,11 +145,15 @@ ALGORITHMS = (
     (Case("ALE/Pong-v5", "ale_py", (ATARI,), (SHORT,), stack=4), _ANY + _DISCRETE),
     (
         Case(
-            "MiniGrid-FourRooms-v0", wrappers=("minigrid.wrappers.ImgObsWrapper",), stack=1, params=(NO_NORM,), **GRID
+            "MiniGrid-FourRooms-v0",
+            wrappers=("minigrid.wrappers.ImgObsWrapper",),
+            stack=1,
+            params=("normalize:False",),
+            **GRID,
         ),
         _ANY + _DISCRETE,
     ),
-    (Case("CarRacing-v3", "", (RESIZE,), (SHORT,), stack=2), _ANY + _BOX),
+    (Case("CarRacing-v3", "", (RESIZE,), (SHORT,), stack=2, params=("normalize:False",)), _ANY + _BOX),
 )
 # In docs/your_environment.md.
 DOCUMENTED = ("ALE/Pong-v5", "MiniGrid-FourRooms-v0", "CarRacing-v3", "dm_control/cartpole-swingup-v0")
@@ -193,25 +197,20 @@ def run_case(case: Case, work: Path, algos: tuple[str, ...] = (), dry: bool = Fa
     folder = work / words
     folder.mkdir(parents=True, exist_ok=True)
     found = folder / "outcome.json"
-    if found.is_file():
-        outcome: dict[str, Any] = json.loads(found.read_bytes())
-        return outcome
+    outcome: dict[str, Any] = json.loads(found.read_bytes()) if found.is_file() else {}
     if dry:
-        return None
-    outcome = {"spaces": _spaces(case)}
+        return outcome or None
+    outcome.setdefault("spaces", _spaces(case))
     commands = case.commands(folder)
-    for name in ("collect", "pretrain"):
-        outcome[name] = run_command(commands[name], folder)
-        if outcome[name]["code"]:
+    for algo in algos or (case.algo,):
+        commands[algo if algos else "train"] = dataclasses.replace(case, algo=algo).commands(folder)["train"]
+    for name in [name for name in commands if name != "train" or not algos]:
+        if outcome.get(name, {}).get("code") != 0:
+            outcome[name] = run_command(commands[name], folder)
+            print(f"{case.env_id} {name}: {outcome[name]['code']}, {outcome[name]['said'][:300]}", flush=True)
+            found.write_text(json.dumps(outcome, indent=1))
+        if outcome[name]["code"] and name in ("collect", "pretrain"):
             break
-    else:
-        for algo in algos or (case.algo,):
-            name = algo if algos else "train"
-            outcome[name] = run_command(dataclasses.replace(case, algo=algo).commands(folder)["train"], folder)
-    for name, one in outcome.items():
-        if name != "spaces":
-            print(f"{case.env_id} {name}: {one['code']}, {one['seconds']:.1f} s, {one['said'][:300]}", flush=True)
-    found.write_text(json.dumps(outcome, indent=1))
     return outcome
 
 
@@ -243,12 +242,16 @@ def is_right(case: Case, outcome: dict[str, Any]) -> bool:
     return len(failed) == 1 and failed[0]["code"] == 2 and re.search(case.refused, failed[0]["said"]) is not None
 
 
+def _word(one: dict[str, Any] | None) -> str:
+    return "-" if one is None else {0: "done", 2: "refused"}.get(one["code"], "failed")
+
+
 def row(case: Case, outcome: dict[str, Any]) -> str:
     """A line of the table."""
     said, seconds, mib = [], [], []
     for name in ("collect", "pretrain", "train"):
         one = outcome.get(name)
-        said.append("-" if one is None else "done" if not one["code"] else f"refused, exit {one['code']}")
+        said.append(_word(one))
         seconds.append("-" if one is None else f"{one['seconds']:.0f}")
         mib.append("-" if one is None else f"{one['mib']:.0f}")
     added = "; ".join(
@@ -309,7 +312,10 @@ def main() -> None:
     outcomes = [(case, outcome) for case, outcome in found if outcome is not None]
     trained = [(case, algos, outcome) for case, algos, outcome in found_algos if outcome is not None]
     wrong = [case.env_id for case, outcome in outcomes if not is_right(case, outcome)]
-    wrong += [f"{case.env_id} {a}" for case, algos, o in trained for a in algos if a not in o or o[a]["code"]]
+    # 2 is a refusal.
+    wrong += [
+        f"{case.env_id} {a}" for case, algos, o in trained for a in algos if o.get(a, {}).get("code") not in (0, 2)
+    ]
     if not args.only:
         _write(outcomes, trained)
     if wrong:
@@ -318,15 +324,19 @@ def main() -> None:
 
 def _write(outcomes: list[Any], trained: list[Any]) -> None:
     refusals = ["", "Refusals:", ""]
-    for case, outcome in outcomes:
-        refusals += [f"* `{case.env_id}`: {one['said']}" for k, one in outcome.items() if k != "spaces" and one["code"]]
+    for case, outcome in [*outcomes, *((case, outcome) for case, _, outcome in trained)]:
+        refusals += [
+            f"* `{case.env_id}`, `{k}`: {one['said'].partition('error: ')[2]}"
+            for k, one in outcome.items()
+            if k != "spaces" and one["code"]
+        ]
     names = list(dict.fromkeys(algo for _, algos, _ in trained for algo in algos))
     missing = [case.env_id for case in CASES if case not in [one for one, _ in outcomes]]
     refusals += ["", f"Not run yet: {', '.join(f'`{name}`' for name in missing)}."] if missing else []
     table = ["", "Algorithms, each with `train` on the same encoder:", ""]
     table += ["| environment | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
     for case, algos, outcome in trained:
-        words = [("done" if not outcome[a]["code"] else "failed") if a in algos else "other actions" for a in names]
+        words = ["other actions" if a not in algos else _word(outcome.get(a)) for a in names]
         table.append(f"| `{case.env_id}` | " + " | ".join(words) + " |")
     write_page(
         RESULTS,

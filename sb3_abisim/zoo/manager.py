@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_abisim.envs import ENV_IDS
@@ -50,7 +51,7 @@ from sb3_abisim.zoo.methods import (
 )
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
 from sb3_abisim.zoo.run_files import hash_run
-from sb3_abisim.zoo.spaces import check_spaces
+from sb3_abisim.zoo.spaces import check_replayed, check_spaces
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
 exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
@@ -70,6 +71,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     env_kwargs: dict[str, Any]
     env_wrapper: Any
     frame_stack: int | None
+    normalize: bool
     eval_env_kwargs: dict[str, Any]
     vec_env_class: type
     save_path: str
@@ -166,11 +168,14 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         :raises ValueError: see :func:`~sb3_abisim.zoo.spaces.check_spaces`
         """
         outer, stack = self.env_wrapper, self.frame_stack
+        algorithm = exp_manager.ALGOS[self.algo]
 
         def wrap(env: Any) -> Any:
             env = env if outer is None else outer(env)
             try:
                 check_spaces(env, stack)
+                if self.normalize and encoding_kwargs(self._used) is None and issubclass(algorithm, OffPolicyAlgorithm):
+                    check_replayed(env, self.algo)
             except ValueError:
                 env.close()
                 raise

@@ -266,7 +266,8 @@ def hyperparameters_entry(algo: str, env_id: str) -> dict[str, Any]:
     path = zoo_hyperparams() / f"{algo}.yml"
     entries = read_entries(path) if path.is_file() else {}
     key = "atari" if exp_manager.ExperimentManager.is_atari(env_id) else "default"
-    for name in (env_id, key, "default"):
+    # As there: no default for Atari.
+    for name in (env_id, key):
         if name in entries:
             return dict(entries[name])
     raise ValueError(f"rl-zoo3 has no hyperparameters of {algo} for {env_id}; choose another with --algo")

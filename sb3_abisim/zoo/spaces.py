@@ -5,6 +5,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
+
+from sb3_abisim.common.spaces import is_channels_first
 
 _NUMBERS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 
@@ -40,3 +43,21 @@ def check_spaces(env: gym.Env[Any, Any], frame_stack: int | None) -> None:
                 f"here, by env_wrapper {{gymnasium.wrappers.ReshapeObservation: {{shape: {[*part.shape, 1]}}}}} or "
                 "GrayscaleObservation: {keep_dim: true}"
             )
+
+
+def check_replayed(env: gym.Env[Any, Any], algo: str) -> None:
+    """Refuse images with channels last for a replay buffer behind ``VecNormalize``.
+
+    The buffer gets what that wrapper was shown, and rl-zoo3 puts channels first after it.
+
+    :param env: with its wrappers
+    :param algo: rl-zoo3's name of the algorithm, for the message
+    :raises ValueError: naming the remedy
+    """
+    space = env.observation_space
+    parts = list(space.spaces.values()) if isinstance(space, spaces.Dict) else [space]
+    if any(is_image_space(part) and not is_channels_first(part.shape or ()) for part in parts):
+        raise ValueError(
+            f"the replay buffer of {algo} cannot hold images with channels last behind normalize (VecNormalize); give "
+            "-params normalize:False"
+        )

@@ -145,3 +145,16 @@ def test_refusals_name_the_remedy(
     assert stopped.value.code == 2
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
     assert message in line
+
+
+def test_rewards_are_not_normalized_behind_a_replay_buffer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Stable-Baselines3's would get images with channels last, and fail at the first step."""
+    *before, train = commands(tmp_path, ["shape:[12, 16, 3]"], [], "dqn")
+    for words in before:
+        run(monkeypatch, *words)
+    with pytest.raises(SystemExit):
+        run(monkeypatch, *train, "normalize:{norm_obs: false}")
+    assert "replay buffer of dqn cannot hold images with channels last" in capsys.readouterr().err
+    run(monkeypatch, *train, "normalize:False")

@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 import torch as th
+from gymnasium.envs.registration import EnvSpec
 from torch import nn
 from zoo_inputs import write_encoder
 
@@ -17,6 +19,7 @@ from sb3_abisim.zoo.methods import (
     MethodRecord,
     MethodSpec,
     encoding_kwargs,
+    hyperparameters_entry,
     resolve_classes,
 )
 
@@ -190,3 +193,11 @@ def test_records(tmp_path: Path) -> None:
         (tmp_path / "method.json").write_text(text)
         with pytest.raises(ValueError, match=r"method\.json is damaged .*leave the run out"):
             MethodRecord.read(tmp_path)
+
+
+def test_no_default_stands_for_atari(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rl-zoo3 looks for an entry of Atari alone, and fails with a KeyError where an algorithm has none."""
+    monkeypatch.setitem(gym.registry, "ALE/Toy-v5", EnvSpec("ALE/Toy-v5", "ale_py.env:AtariEnv"))
+    assert hyperparameters_entry("ppo", "ALE/Toy-v5")["frame_stack"] == 4
+    with pytest.raises(ValueError, match="no hyperparameters of trpo for ALE/Toy-v5; choose another with --algo"):
+        hyperparameters_entry("trpo", "ALE/Toy-v5")
