@@ -9,7 +9,6 @@ import index_env  # noqa: F401  registers ids
 import numpy as np
 import pytest
 
-from sb3_abisim.data import chains
 from sb3_abisim.data import writer as writer_module
 from sb3_abisim.data.collect import collect
 from sb3_abisim.data.command import main
@@ -23,21 +22,7 @@ minari = pytest.importorskip("minari")
 h5py = pytest.importorskip("h5py")
 
 
-@pytest.fixture(autouse=True)
-def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", 48)
-    return tmp_path / "minari"
-
-
-@pytest.fixture(autouse=True)
-def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exchange with Minari must not make an environment."""
-
-    def refuse(*args: object, **kwargs: object) -> None:
-        pytest.fail(f"gymnasium.make({args}, {kwargs})")
-
-    monkeypatch.setattr(gym, "make", refuse)
+pytestmark = pytest.mark.usefixtures("store", "no_environment")
 
 
 @pytest.fixture

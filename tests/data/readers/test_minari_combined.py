@@ -11,7 +11,6 @@ import index_env
 import numpy as np
 import pytest
 
-from sb3_abisim.data import chains
 from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import CUT, TERMINATED
@@ -22,16 +21,7 @@ from sb3_abisim.data.writer import Segment, write_dataset
 minari = pytest.importorskip("minari")
 
 
-@pytest.fixture(autouse=True)
-def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", 48)
-    return tmp_path / "minari"
-
-
-@pytest.fixture(autouse=True)
-def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gym, "make", lambda *args, **kwargs: pytest.fail(f"gymnasium.make({args}, {kwargs})"))
+pytestmark = pytest.mark.usefixtures("store", "no_environment")
 
 
 # Its entry point is a text, which Minari can store.
