@@ -30,6 +30,8 @@ def require(ending: str) -> None:
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("name", ["Nav2D-v0/abisim", "PointMaze-v0/ssi", "ScanNav-v0/abisim"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
+# Of torch 2.10, when it opens a program.
+@pytest.mark.filterwarnings("ignore:The given buffer is not writable:UserWarning")
 def test_embeddings_are_those_of_the_encoder(name: str, ending: str, tmp_path: Path) -> None:
     require(ending)
     path = tmp_path / "new" / f"encoder.{ending}"

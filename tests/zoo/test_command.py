@@ -273,6 +273,8 @@ def test_plain_zoo_command_in_the_checkout(tmp_path: Path) -> None:
 
 def test_record_video_in_the_checkout(tmp_path: Path) -> None:
     """It imports the manager first, and with it custom_envs, while the manager's module is half done."""
+    # Stable-Baselines3 records with it; rl-zoo3 does not ask for it.
+    pytest.importorskip("moviepy")
     encoder = tmp_path / "mine.safetensors"
     write_encoder(encoder, "DistractorPointMaze-v0", "ssi")
     argv = ["--algo", "ppo", "--env", "DistractorPointMaze-v0", "-f", str(tmp_path)]
