@@ -20,6 +20,8 @@ from sb3_abisim.networks.export import export_encoder
 
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"
 ENDINGS = ("pt2", "onnx")
+# Of torch 2.10, once in a process, when it opens a program.
+pytestmark = pytest.mark.filterwarnings("ignore:The given buffer is not writable:UserWarning")
 
 
 def require(ending: str) -> None:
@@ -30,8 +32,6 @@ def require(ending: str) -> None:
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("name", ["Nav2D-v0/abisim", "PointMaze-v0/ssi", "ScanNav-v0/abisim"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-# Of torch 2.10, when it opens a program.
-@pytest.mark.filterwarnings("ignore:The given buffer is not writable:UserWarning")
 def test_embeddings_are_those_of_the_encoder(name: str, ending: str, tmp_path: Path) -> None:
     require(ending)
     path = tmp_path / "new" / f"encoder.{ending}"
