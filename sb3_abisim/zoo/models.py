@@ -199,3 +199,18 @@ def _tensors(value: Any) -> Iterator[th.Tensor]:
     elif isinstance(value, list | tuple):
         for part in value:
             yield from _tensors(part)
+
+
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a saved model holds that can be read without unpickling.
+
+    :param path: the zip
+    :return: its JSON, in which pickled values are texts, and the state dicts of the policy and of optimizers by name
+    :raises ValueError: for a damaged zip, or anything else
+    """
+    try:
+        data, _ = _read_data(path)
+        _, params, _ = load_from_zip_file(path, load_data=False, device="cpu")
+    except Exception as error:
+        raise ValueError(f"{path} is damaged or no model of Stable-Baselines3 ({error}); copy it again") from error
+    return data, params
