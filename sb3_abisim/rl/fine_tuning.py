@@ -104,7 +104,8 @@ class FineTuning:
             return
         encoders = [extractor.encoder for _, extractor in find_extractors(policy)]
         parameters = [parameter for encoder in encoders for parameter in encoder.parameters()]
-        if not parameters:
+        routed = [] if self.encoder_trained_by is None else list(policy.critic.features_extractor.parameters())
+        if not (parameters or self._schedule is None) or not (routed or self.encoder_trained_by is None):
             raise ValueError(
                 "encoder_lr, encoder_lr_factor and encoder_trained_by are for an encoder that RL trains, and the "
                 "policy holds none; use a features extractor of sb3_abisim with freeze=False, or remove them"
