@@ -103,10 +103,11 @@ class EncoderCallback(BaseCallback):
                 "it cannot be trained; give freeze: true in features_extractor_kwargs instead of ',frozen' or "
                 "VecEncodeObservations"
             )
-        elif self.unfreeze_at is not None and self.num_timesteps < self.unfreeze_at:
+        elif self.unfreeze_at is not None and not getattr(self.model, "_n_updates", 0):
+            # One that has been trained may be a run that goes on after that step; rl-zoo3 counts steps anew then.
             raise ValueError(
-                f"unfreeze_at={self.unfreeze_at}, but at step {self.num_timesteps} the policy holds no frozen encoder; "
-                "give freeze=True in features_extractor_kwargs, or remove unfreeze_at"
+                f"unfreeze_at={self.unfreeze_at}, but the policy holds no frozen encoder; give freeze=True in "
+                "features_extractor_kwargs, or remove unfreeze_at"
             )
         else:
             self._install()

@@ -47,6 +47,7 @@ from sb3_abisim.zoo.methods import (
     hyperparameters_file,
     policy_of,
     resolve_classes,
+    unfreezes,
     zoo_hyperparams,
 )
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
@@ -229,7 +230,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
-        frozen = bool(kwargs.get("freeze", False))
+        frozen = bool(kwargs.get("freeze", False)) and not unfreezes(self._used)
         return MethodRecord(method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
@@ -260,7 +261,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         asked = hyperparams.get("policy_kwargs") or {}
         model: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
         try:
-            check_trained_with(model, asked)
+            check_trained_with(model, asked, unfreezes(self._used))
         except ValueError as error:
             env.close()
             raise ValueError(f"cannot continue {self.trained_agent}: {error}; give the same --conf-file") from error

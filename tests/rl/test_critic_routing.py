@@ -1,7 +1,7 @@
 """Which loss moves which parameters of SAC, TD3 and TQC, and the encoder that actor and critic share."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -81,7 +81,14 @@ def test_which_loss_moves_which_parameters(path: Path, name: str, monkeypatch: p
         assert moved(model, kept, monkeypatch, **settings) == expected, (shared, kept, settings)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("optimizer", [th.optim.SGD, th.optim.AdamW])
+class Nested(th.optim.Adam):
+    """A step that calls its parent's, both with torch's hooks."""
+
+    def step(self, closure: Callable[[], float] | None = None) -> Any:  # type: ignore[override]
+        return super().step(closure)
+
+
+@pytest.mark.parametrize("optimizer", [th.optim.SGD, th.optim.AdamW, Nested])
 @pytest.mark.parametrize("name", OFF_POLICY)
 def test_the_encoder_makes_one_step_by_the_gradient_of_the_critics_loss(path: Path, name: str, optimizer: Any) -> None:
     """Compared with the same loss computed here, for two updates, the second one with what the first has left."""

@@ -10,7 +10,7 @@ import pytest
 import stable_baselines3 as sb3
 import torch as th
 from extractor_inputs import ALGORITHMS, VARIANTS, RandomImages, build
-from stable_baselines3.common.callbacks import CallbackList
+from stable_baselines3.common.callbacks import CallbackList, ConvertCallback
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 
 from sb3_abisim import EncoderCallback
@@ -152,6 +152,16 @@ def test_a_run_that_fails_leaves_nothing_behind(path: Path) -> None:
     with pytest.raises(ValueError, match=r"encoder_lr is -1\.0 at remaining progress .*let its schedule"):
         model.learn(16, callback=callback)
     check(model, recorded(model, encoder_lr=1e-5), lambda *_: 1e-5)
+
+    def fail(*_: Any) -> bool:
+        if model.num_timesteps > 12:
+            raise RuntimeError("the environment is gone")
+        return True
+
+    with pytest.raises(RuntimeError, match="is gone"):
+        model.learn(16, callback=CallbackList([EncoderCallback(encoder_lr=1e-5), ConvertCallback(fail)]))
+    check(model, recorded(model, encoder_lr_factor=0.5), lambda _, lr: lr / 2)
+    assert len(model.policy.optimizer.param_groups) == 1
     assert not any(isinstance(value, FineTuning) for value in vars(model.policy).values())
 
 
