@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 
@@ -85,30 +86,45 @@ class EncoderCallback(BaseCallback):
             )
         elif not self._extractors:
             print("Encoder: none of sb3_abisim's, policy_kwargs names another features extractor")
-        self._start_fine_tuning(encoding)
+        self._start_fine_tuning()
         if self.training_env.has_attr("content_hash"):
             (content_hash,) = self.training_env.get_attr("content_hash", indices=0)
             print(f"Content hash of the training environment: {content_hash}")
 
-    def _start_fine_tuning(self, encoding: VecEncodeObservations | None) -> None:
-        self._fine_tuning.check(self.model)
-        frozen = any(extractor.frozen for extractor in self._extractors)
-        self._unfreezes = frozen and self.unfreeze_at is not None
+    def check(self, model: BaseAlgorithm) -> None:
+        """Refuse a model that the arguments are not for; training starts with it, and commands ask before.
+
+        :param model: with its environment
+        :raises ValueError: with the reason
+        """
+        unfreezes = self._is_to_unfreeze(model)
+        self._fine_tuning.check(model, unfreezes)
+        if unfreezes:
+            require_unfreezable(model)
+        elif self.unfreeze_at is not None:
+            env = model.get_env()
+            encoding = None if env is None else unwrap_vec_wrapper(env, VecEncodeObservations)
+            if encoding is not None:
+                raise ValueError(
+                    f"unfreeze_at={self.unfreeze_at}, but {encoding.source} embeds observations in the environment, "
+                    "where it cannot be trained; give freeze: true in features_extractor_kwargs instead of ',frozen' "
+                    "or VecEncodeObservations"
+                )
+            # A model that has been trained may have passed that step: rl-zoo3 counts anew when it continues a run.
+            if not getattr(model, "_n_updates", 0):
+                raise ValueError(
+                    f"unfreeze_at={self.unfreeze_at}, but the policy holds no frozen encoder; give freeze=True in "
+                    "features_extractor_kwargs, or remove unfreeze_at"
+                )
+
+    def _is_to_unfreeze(self, model: BaseAlgorithm) -> bool:
+        return self.unfreeze_at is not None and any(encoder.frozen for _, encoder in find_extractors(model.policy))
+
+    def _start_fine_tuning(self) -> None:
+        self.check(self.model)
+        self._unfreezes = self._is_to_unfreeze(self.model)
         if self._unfreezes:
-            require_unfreezable(self.model)
             print(f"Encoder: frozen until step {self.unfreeze_at}, fine-tuned from then on")
-        elif self.unfreeze_at is not None and encoding is not None:
-            raise ValueError(
-                f"unfreeze_at={self.unfreeze_at}, but {encoding.source} embeds observations in the environment, where "
-                "it cannot be trained; give freeze: true in features_extractor_kwargs instead of ',frozen' or "
-                "VecEncodeObservations"
-            )
-        elif self.unfreeze_at is not None and not getattr(self.model, "_n_updates", 0):
-            # One that has been trained may be a run that goes on after that step; rl-zoo3 counts steps anew then.
-            raise ValueError(
-                f"unfreeze_at={self.unfreeze_at}, but the policy holds no frozen encoder; give freeze=True in "
-                "features_extractor_kwargs, or remove unfreeze_at"
-            )
         else:
             self._install()
 

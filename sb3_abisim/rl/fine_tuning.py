@@ -6,6 +6,7 @@ from typing import Any
 
 from sb3_contrib import TRPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
 
 from sb3_abisim.rl.checks import find_extractors
 from sb3_abisim.rl.critic_routing import CriticRouting, check_routing
@@ -74,12 +75,14 @@ class FineTuning:
         """Whether all is as Stable-Baselines3 does it."""
         return self._schedule is None and self.encoder_trained_by is None
 
-    def check(self, model: BaseAlgorithm) -> None:
-        """Refuse a model that cannot be fine-tuned like this, whether or not its encoder is frozen so far.
+    def check(self, model: BaseAlgorithm, is_frozen: bool = False) -> None:
+        """Refuse a model that cannot be fine-tuned like this.
 
         :param model: of any algorithm
+        :param is_frozen: whether its encoders are frozen now and unfrozen later
         :raises ValueError: with the reason
         """
+        policy: Any = model.policy
         if self.encoder_trained_by is not None:
             check_routing(model)
         if self._schedule is not None and isinstance(model, TRPO):
@@ -87,12 +90,19 @@ class FineTuning:
                 f"{self._rate_name} with {type(model).__name__}, whose policy is moved by a line search and not by an "
                 f"optimizer; remove {self._rate_name}, or take PPO"
             )
+        has_encoder = self._schedule is None or bool(_encoder_parameters(policy))
+        has_shared = self.encoder_trained_by is None or any(True for _ in policy.critic.features_extractor.parameters())
+        if not is_frozen and not (has_encoder and has_shared):
+            raise ValueError(
+                "encoder_lr, encoder_lr_factor and encoder_trained_by are for an encoder that RL trains, and the "
+                "policy holds none; use a features extractor of sb3_abisim with freeze=False, or remove them"
+            )
 
     def install(self, model: BaseAlgorithm) -> None:
         """Train the model's encoders like this from now on.
 
         :param model: with encoders that are not frozen
-        :raises ValueError: as :meth:`check`, or if it has no such encoder
+        :raises ValueError: as :meth:`check`
         """
         policy: Any = model.policy
         before = getattr(policy, _ATTRIBUTE, None)
@@ -102,16 +112,9 @@ class FineTuning:
         self.check(model)
         if self.is_default:
             return
-        encoders = [extractor.encoder for _, extractor in find_extractors(policy)]
-        parameters = [parameter for encoder in encoders for parameter in encoder.parameters()]
-        routed = [] if self.encoder_trained_by is None else list(policy.critic.features_extractor.parameters())
-        if not (parameters or self._schedule is None) or not (routed or self.encoder_trained_by is None):
-            raise ValueError(
-                "encoder_lr, encoder_lr_factor and encoder_trained_by are for an encoder that RL trains, and the "
-                "policy holds none; use a features extractor of sb3_abisim with freeze=False, or remove them"
-            )
         setattr(policy, _ATTRIBUTE, self)
         if self._schedule is not None:
+            parameters = _encoder_parameters(policy)
             ids = {id(parameter) for parameter in parameters}
             for owner, held in policy_optimizers(policy):
                 if any(id(parameter) in ids for parameter in held):
@@ -140,3 +143,8 @@ class FineTuning:
         rate = value if self._rate_name == "encoder_lr" else lr * value
         model.logger.record("encoder/learning_rate", rate)
         return rate
+
+
+def _encoder_parameters(policy: nn.Module) -> list[nn.Parameter]:
+    encoders = [extractor.encoder for _, extractor in find_extractors(policy)]
+    return [parameter for encoder in encoders for parameter in encoder.parameters()]
