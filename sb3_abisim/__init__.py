@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from sb3_abisim.rl.combined import CombinedEncoderExtractor
     from sb3_abisim.rl.extractors import EncoderExtractor
     from sb3_abisim.rl.merge import merge_encoder
-    from sb3_abisim.rl.optimizers import EncoderLRAdam
     from sb3_abisim.rl.policy_kwargs import policy_kwargs
     from sb3_abisim.rl.unfreeze import unfreeze_encoder
     from sb3_abisim.rl.vec_encode import VecEncodeObservations
@@ -46,7 +45,6 @@ _PUBLIC = {
     "Encoder": "networks.base",
     "EncoderCallback": "rl.callbacks",
     "EncoderExtractor": "rl.extractors",
-    "EncoderLRAdam": "rl.optimizers",
     "Objective": "objectives.base",
     "PointMazePixels": "envs.point_maze.pixel_wrapper",
     "Segment": "data.writer",
@@ -77,7 +75,6 @@ __all__ = [
     "Encoder",
     "EncoderCallback",
     "EncoderExtractor",
-    "EncoderLRAdam",
     "EnvTraits",
     "Objective",
     "PointMazePixels",

@@ -29,7 +29,6 @@ from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
 from sb3_abisim.rl.file_network import build_network, check_objective, read_network
 from sb3_abisim.rl.frozen_weights import buffers_to_parameters, parameters_to_buffers
-from sb3_abisim.rl.optimizers import mark_encoder
 
 
 class BaseEncoderExtractor(BaseFeaturesExtractor):
@@ -48,16 +47,10 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
     def __init__(self, observation_space: gym.Space[Any], encoder: Encoder) -> None:
         super().__init__(observation_space, encoder.features_dim)
         self.encoder = encoder
-        mark_encoder(encoder)
         self._weight_names = [name for name, _ in encoder.named_parameters()]
         self.register_buffer("initial_weights", self._flat_weights().clone())
         self._input_checked = False
         self._image_check = ImageCheck()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        # Copies of parameters lose it.
-        mark_encoder(self.encoder)
 
     @property
     def hash(self) -> str | None:
@@ -269,7 +262,6 @@ class PretrainedExtractor(BaseEncoderExtractor):
             return []
         parameters = buffers_to_parameters(self.encoder, self._weight_names)
         self.frozen = False
-        mark_encoder(self.encoder)
         self.encoder.train(self.training)
         return parameters
 

@@ -37,6 +37,7 @@ from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
+from sb3_abisim.rl.callbacks import EncoderCallback
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
 from sb3_abisim.zoo.methods import (
@@ -47,6 +48,7 @@ from sb3_abisim.zoo.methods import (
     hyperparameters_file,
     policy_of,
     resolve_classes,
+    unfreezes,
     zoo_hyperparams,
 )
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
@@ -66,6 +68,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     """``rl_zoo3.exp_manager.ExperimentManager`` that knows methods; parameters as there."""
 
     algo: str
+    callbacks: list[Any]
     config: str
     custom_hyperparams: dict[str, Any] | None
     env_kwargs: dict[str, Any]
@@ -229,14 +232,18 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
-        frozen = bool(kwargs.get("freeze", False))
+        frozen = bool(kwargs.get("freeze", False)) and not unfreezes(self._used)
         return MethodRecord(method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing)
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """As rl-zoo3 does.
+        """As rl-zoo3 does, once the encoder's callback agrees.
 
         :param model: to train
+        :raises ValueError: for a model that its arguments are not for
         """
+        for callback in self.callbacks:
+            if isinstance(callback, EncoderCallback):
+                callback.check(model)
         MethodExperimentManager.has_begun = True
         super().learn(model)
 
@@ -260,7 +267,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         asked = hyperparams.get("policy_kwargs") or {}
         model: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
         try:
-            check_trained_with(model, asked)
+            check_trained_with(model, asked, unfreezes(self._used))
         except ValueError as error:
             env.close()
             raise ValueError(f"cannot continue {self.trained_agent}: {error}; give the same --conf-file") from error

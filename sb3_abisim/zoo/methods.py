@@ -342,6 +342,17 @@ def encoding_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any] | None:
     return None
 
 
+def unfreezes(hyperparams: Mapping[str, Any]) -> bool:
+    """Whether the ``EncoderCallback`` of a zoo entry unfreezes a frozen encoder at some step.
+
+    :param hyperparams: of a zoo entry, or of a run's ``config.yml``
+    """
+    for item in items(hyperparams.get("callback")):
+        if isinstance(item, Mapping) and class_name(item) == ENCODER_CALLBACK.rpartition(".")[2]:
+            return (next(iter(item.values())) or {}).get("unfreeze_at") is not None
+    return False
+
+
 def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:
     encoder = (policy_kwargs.get("features_extractor_kwargs") or {}).get("encoder")
     return None if encoder is None else str(encoder)

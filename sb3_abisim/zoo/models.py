@@ -27,6 +27,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 
 from sb3_abisim.networks.bounded import BoundedTensors
+from sb3_abisim.rl.unfreeze import unfreeze_encoder
 from sb3_abisim.zoo.named import named_class, named_policy_kwargs
 from sb3_abisim.zoo.run_files import read_yaml
 from sb3_abisim.zoo.runs import Run
@@ -179,6 +180,9 @@ def _restore(model: BaseAlgorithm, path: Path, data: Mapping[str, Any]) -> None:
         # One number could stand for a tensor of any size.
         if tensor.layout != th.strided or tensor.nbytes > tensor.untyped_storage().nbytes():
             raise ValueError("its weights are no plain tensors")
+    if _n_optimized(params) > _n_optimized(model.get_parameters()):
+        # Saved after unfreeze_at, and built from a configuration that says freeze: true.
+        unfreeze_encoder(model)
     model.set_parameters(params, exact_match=True, device="cpu")
     for name, value in (variables or {}).items():
         if value is not None and name in model._get_torch_save_params()[1]:
@@ -189,6 +193,12 @@ def _restore(model: BaseAlgorithm, path: Path, data: Mapping[str, Any]) -> None:
             setattr(model, name, number)
     if model.use_sde:
         model.policy.reset_noise()  # type: ignore[operator]
+
+
+def _n_optimized(parameters: Mapping[str, Any]) -> int:
+    """How many parameters the optimizers hold, of a model's ``get_parameters()``."""
+    states = [state for state in parameters.values() if isinstance(state, Mapping)]
+    return sum(len(group["params"]) for state in states for group in state.get("param_groups", ()))
 
 
 def _tensors(value: Any) -> Iterator[th.Tensor]:

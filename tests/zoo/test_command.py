@@ -153,6 +153,10 @@ def test_values_reach_rl_zoo3(
     assert args["gym_packages"] == ["toy_env"]
 
 
+# In one word: a pair for the only argument of the callback.
+FINE_TUNED = '--env Nav2D-v0 -params callback:{{"sb3_abisim.EncoderCallback":{{"{}":{}}}}} n_envs:2 n_steps:32 batch_size:32'
+
+
 # rl-zoo3 leaves the monitor files open that it had opened before the mistake.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
@@ -169,6 +173,11 @@ def test_values_reach_rl_zoo3(
         ("--env Nav2D-v0 --packages no_such_module", "--packages: cannot import 'no_such_module'"),
         ("--env Nav2D-v0 -i no_such_model.zip", "trained_agent must be a valid path"),
         ("--env Toy-v0 --packages toy_env --conf-file ssi", "no encoder ships for this environment"),
+        (f"{FINE_TUNED.format('unfreeze_at', 9)} --conf-file vanilla", "the policy holds no frozen encoder"),
+        (f"{FINE_TUNED.format('unfreeze_at', 9)} --conf-file abisim,frozen", "give freeze: true in features_extractor"),
+        (f"{FINE_TUNED.format('encoder_lr', 0)} --conf-file vanilla", "encoder_lr must be a number above 0"),
+        (f"{FINE_TUNED.format('encoder_lrr', 1)} --conf-file vanilla", "unexpected keyword argument 'encoder_lrr'"),
+        (f"{FINE_TUNED.format('encoder_trained_by', 'critic')} --conf-file vanilla", "is for SAC, TD3 and TQC"),
     ],
 )
 def test_mistakes_are_one_line(

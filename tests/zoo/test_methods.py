@@ -12,7 +12,6 @@ from torch import nn
 from zoo_inputs import write_encoder
 
 from sb3_abisim.rl.extractor_classes import extractor_class
-from sb3_abisim.rl.optimizers import EncoderLRAdam
 from sb3_abisim.zoo.methods import (
     ENCODER_CALLBACK,
     ENCODING_WRAPPER,
@@ -152,14 +151,14 @@ def test_classes_by_dotted_path() -> None:
     kwargs = {
         "features_extractor_class": "sb3_abisim.SSIExtractor",
         "activation_fn": "torch.nn.ReLU",
-        "optimizer_class": "sb3_abisim.EncoderLRAdam",
+        "optimizer_class": "torch.optim.AdamW",
         "net_arch": {"pi": [7]},
     }
     before = dict(kwargs)
     assert resolve_classes(kwargs) == {
         "features_extractor_class": extractor_class("ssi"),
         "activation_fn": nn.ReLU,
-        "optimizer_class": EncoderLRAdam,
+        "optimizer_class": th.optim.AdamW,
         "net_arch": {"pi": [7]},
     }
     assert kwargs == before
