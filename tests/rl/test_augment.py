@@ -109,7 +109,12 @@ def test_a_saved_model_goes_on_with_its_augmentation(tmp_path: Path, name: str) 
 
 
 def test_drq_is_vanilla_on_shifted_observations() -> None:
-    vanilla, drq = VanillaExtractor(SPACE), sb3_abisim.DrQExtractor(SPACE)
+    th.manual_seed(0)
+    vanilla, after = VanillaExtractor(SPACE), th.rand(3)
+    th.manual_seed(0)
+    drq = sb3_abisim.DrQExtractor(SPACE)
+    # What the policy draws next is the same for both.
+    assert th.equal(th.rand(3), after)
     assert vanilla.augment is None and isinstance(drq, VanillaExtractor) and drq.augment is not None
     drq.load_state_dict(vanilla.state_dict())
     assert th.equal(drq.eval()(INPUTS), vanilla(INPUTS))
