@@ -66,7 +66,9 @@ SHOWN = {
     ("SAC", False): ACTOR + CRITIC,
     ("SAC", True): ACTOR,
     ("TD3", False): ACTOR + CRITIC,
+    ("TD3", True): ACTOR,
     ("TQC", False): ACTOR + CRITIC,
+    ("TQC", True): ACTOR,
 }
 
 
