@@ -189,12 +189,9 @@ class VanillaExtractor(BaseEncoderExtractor):
     :param observation_space: uint8 images in 0..255, channels first
     :param network: name of the network; None takes the one made for the observation's shape
     :param network_kwargs: its keyword arguments
-    :param task_features_dim: size of a small network's output that is appended to the embedding; RL trains it from
-        scratch, whether the encoder is frozen or not. 0 for none (:mod:`sb3_abisim.rl.task_features`)
-    :param augment: what observations are augmented by while they are learned from: "random_shift" (DrQ),
-        "random_crop", "color_jitter", another registered name or ``pkg.module:Function``
-        (:mod:`sb3_abisim.rl.augment`)
-    :param augment_kwargs: its keyword arguments
+    :param task_features_dim: see :class:`BaseEncoderExtractor`
+    :param augment: see :class:`BaseEncoderExtractor`
+    :param augment_kwargs: see :class:`BaseEncoderExtractor`
     :raises ValueError: for an observation space that is not of images or does not fit the network
     """
 
@@ -237,12 +234,9 @@ class PretrainedExtractor(BaseEncoderExtractor):
     :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
     :param network: name of the network; None takes the one made for the observation's shape
     :param network_kwargs: its keyword arguments
-    :param task_features_dim: size of a small network's output that is appended to the embedding; RL trains it from
-        scratch, whether the encoder is frozen or not. 0 for none (:mod:`sb3_abisim.rl.task_features`)
-    :param augment: what observations are augmented by while they are learned from: "random_shift" (DrQ),
-        "random_crop", "color_jitter", another registered name or ``pkg.module:Function``
-        (:mod:`sb3_abisim.rl.augment`)
-    :param augment_kwargs: its keyword arguments
+    :param task_features_dim: see :class:`BaseEncoderExtractor`
+    :param augment: see :class:`BaseEncoderExtractor`
+    :param augment_kwargs: see :class:`BaseEncoderExtractor`
     :raises ValueError: for a damaged file, or one of another objective, other observations or another network
     """
 
@@ -372,12 +366,9 @@ class EncoderExtractor(PretrainedExtractor):
     :param network: name of the network; None reads it from the file, unless that is a ``pkg.module:Factory``, which is
         imported only if you name it
     :param network_kwargs: its keyword arguments; None reads them from the file
-    :param task_features_dim: size of a small network's output that is appended to the embedding; RL trains it from
-        scratch, whether the encoder is frozen or not. 0 for none (:mod:`sb3_abisim.rl.task_features`)
-    :param augment: what observations are augmented by while they are learned from: "random_shift" (DrQ),
-        "random_crop", "color_jitter", another registered name or ``pkg.module:Function``
-        (:mod:`sb3_abisim.rl.augment`)
-    :param augment_kwargs: its keyword arguments
+    :param task_features_dim: see :class:`BaseEncoderExtractor`
+    :param augment: see :class:`BaseEncoderExtractor`
+    :param augment_kwargs: see :class:`BaseEncoderExtractor`
     :raises ValueError: for a damaged file, or one of other observations or another network
     """
 
