@@ -13,16 +13,18 @@ def _like(env_id: str, traits: EnvTraits) -> EnvTraits:
     return dataclasses.replace(traits, same_observations_as=env_id)
 
 
-_NAV2D = EnvTraits(algo="dqn", n_transitions=1_000_000, return_range=(-50.0, 0.0), length_unit="cells")
+_NAV2D = EnvTraits(
+    algo="dqn", n_transitions=1_000_000, return_range=(-50.0, 0.0), free_kwargs=("goal",), length_unit="cells"
+)
 # The fixed structures look like the random layouts.
 _NAV2D_STRUCTURE = _like("Nav2D-v0", _NAV2D)
-_POINT_MAZE = EnvTraits(n_transitions=250_000, return_range=(-128.0, 0.0))
+_POINT_MAZE = EnvTraits(n_transitions=250_000, return_range=(-128.0, 0.0), free_kwargs=("goal",))
 _DISTRACTOR = EnvTraits(
     n_transitions=250_000,
     return_range=(-128.0, 0.0),
     splits=("eval", "train", "clean"),
     split_kwargs=("split", "clips"),
-    free_kwargs=("split", "clips", "videos"),
+    free_kwargs=("split", "clips", "videos", "goal"),
 )
 # Encoders that were pretrained with the goal in the center fit, though they have not seen it elsewhere.
 _RANDOM_GOAL: dict[str, Any] = {"goal": "random"}

@@ -13,6 +13,8 @@ SIZE = 15
 N_OBSTACLES = 20
 OBSTACLE_SIZE = 2
 GOAL = (7, 7)
+# Places of the goal with goal="corners": four cells from the edges.
+CORNERS = ((3, 3), (11, 3), (3, 11), (11, 11))
 # (dx, dy) of actions 0 to 3; x points right, y points down: up, down, left, right.
 MOVES = ((0, -1), (0, 1), (-1, 0), (1, 0))
 CHANNELS = ("agent", "obstacles", "goal")
@@ -44,6 +46,7 @@ _CELL_PIXELS = 32
 
 _N_CELLS = SIZE * SIZE
 _GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
+_CORNER_CELLS = np.array([y * SIZE + x for x, y in CORNERS])
 # Bitboards of :mod:`~sb3_abisim.common.grids`; their sixteenth column is never free.
 _STRIDE = SIZE + 1
 _BITS = np.array([1 << (y * _STRIDE + x) for y in range(SIZE) for x in range(SIZE)], dtype=object)
@@ -100,17 +103,19 @@ class Nav2DVectorEnv(BatchEnv):
     chose their cells.
 
     **Goal**: the center (7, 7). ``goal="random"`` (``Nav2DRandomGoal-v0``) samples it in each episode, uniformly over
-    all cells, or over the reachable ones of a fixed structure, and then agent and obstacles as above.
+    all cells, or over the reachable ones of a fixed structure, and then agent and obstacles as above. ``"corners"``
+    samples it from (3, 3), (11, 3), (3, 11) and (11, 11), with random obstacles alone.
 
-    **Factors**: agent (x, y), int64 (2,); obstacles by [y, x], bool (15, 15); with a random goal also goal (x, y).
+    **Factors**: agent (x, y), int64 (2,); obstacles by [y, x], bool (15, 15); unless the goal is the center also goal
+    (x, y).
 
     :param num_envs: number of copies
     :param max_episode_steps: set by ``gymnasium.make_vec``
     :param render_mode: None or "rgb_array"
     :param autoreset: see :class:`BatchEnv`
     :param layout: "random", "corridor" or "maze"
-    :param goal: "center" or "random"
-    :raises ValueError: for another layout or goal
+    :param goal: "center", "random" or "corners"
+    :raises ValueError: for another layout or goal, or corners in a fixed structure
     """
 
     def __init__(
@@ -122,8 +127,10 @@ class Nav2DVectorEnv(BatchEnv):
         layout: str = "random",
         goal: str = "center",
     ) -> None:
-        if goal not in ("center", "random"):
-            raise ValueError(f"goal must be 'center' or 'random', got {goal!r}")
+        if goal not in ("center", "random", "corners"):
+            raise ValueError(f"goal must be 'center', 'random' or 'corners', got {goal!r}")
+        if goal == "corners" and layout != "random":
+            raise ValueError(f"goal='corners' may be blocked in layout={layout!r}; give goal='random'")
         if layout != "random" and layout not in LAYOUTS:
             raise ValueError(f"layout must be one of {['random', *LAYOUTS]}, got {layout!r}")
         super().__init__(
@@ -157,7 +164,7 @@ class Nav2DVectorEnv(BatchEnv):
             self._observations[i, 0] = 0
             self._observations[i, 0, cell] = 255
             self._observations[i, 1] = np.where(obstacles, 255, 0)
-            if self.goal == "random":
+            if self.goal != "center":
                 self._observations[i, 2] = 0
                 self._observations[i, 2, goal] = 255
                 self._goals[i] = self._first[i] + goal
@@ -166,7 +173,7 @@ class Nav2DVectorEnv(BatchEnv):
     def _sample_random(self, generator: np.random.Generator) -> tuple[int, int, NDArray[np.bool_]]:
         """The cells of agent and goal, and obstacles (SIZE * SIZE,) that leave a path between them."""
         while True:
-            goal = int(generator.integers(SIZE * SIZE)) if self.goal == "random" else _GOAL_CELL
+            goal = self._sample_goal(generator, np.arange(SIZE * SIZE))
             cell = int(generator.integers(SIZE * SIZE - 1))
             cell += cell >= goal
             allowed = _BLOCKS_SPARING[cell] if goal == _GOAL_CELL else np.flatnonzero(_SPARES[cell] & _SPARES[goal])
@@ -180,9 +187,15 @@ class Nav2DVectorEnv(BatchEnv):
                 obstacles[_BLOCK_CELLS[blocks]] = True
                 return cell, goal, obstacles
 
+    def _sample_goal(self, generator: np.random.Generator, cells: NDArray[np.int64]) -> int:
+        """The goal's cell: the center, without sampling, or one of the corners or of ``cells``."""
+        if self.goal == "center":
+            return _GOAL_CELL
+        return int(generator.choice(_CORNER_CELLS if self.goal == "corners" else cells))
+
     def _sample_fixed(self, generator: np.random.Generator) -> tuple[int, int, NDArray[np.bool_]]:
         """The cells of agent and goal in the fixed reachable region, and its walls with new scenery beyond them."""
-        goal = int(generator.choice(self._reachable)) if self.goal == "random" else _GOAL_CELL
+        goal = self._sample_goal(generator, self._reachable)
         # The agent starts anywhere there but on the goal.
         starts = self._reachable[self._reachable != goal]
         cell = int(starts[generator.integers(len(starts))])
@@ -206,7 +219,7 @@ class Nav2DVectorEnv(BatchEnv):
         """The simulator's state that the current observations show, for probes; see the class."""
         obstacles = self._observations[:, 1].reshape(-1, SIZE, SIZE) > 0
         factors = {"agent": self._positions(self._agents), "obstacles": obstacles}
-        return factors | ({"goal": self._positions(self._goals)} if self.goal == "random" else {})
+        return factors | ({} if self.goal == "center" else {"goal": self._positions(self._goals)})
 
     def _positions(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """The (x, y) of one cell in each copy, shape (num_envs, 2)."""

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_abisim.envs.nav2d import GOAL, LAYOUTS, MOVES, Nav2DEnv, Nav2DVectorEnv
+from sb3_abisim.envs.nav2d import CORNERS, GOAL, LAYOUTS, MOVES, Nav2DEnv, Nav2DVectorEnv
 
 IDS = ["Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0", "Nav2DRandomGoal-v0"]
 
@@ -117,6 +117,17 @@ def test_random_goals_lie_on_any_cell_that_the_agent_can_reach(layout):
         assert sum(not {0, 14}.isdisjoint(goal) for goal in goals) == pytest.approx(1200 * 56 / 225, abs=24)
 
 
+def test_goals_in_the_corners():
+    env = Nav2DVectorEnv(num_envs=400, goal="corners")
+    observations, _ = env.reset(seed=0)
+    goals = []
+    for observation, factor in zip(observations, env.factors()["goal"], strict=True):
+        agent, obstacles, goal = cells(observation)
+        assert goal == tuple(factor) != agent and goal in reachable(agent, obstacles)
+        goals.append(goal)
+    assert {goal: goals.count(goal) for goal in goals} == pytest.approx(dict.fromkeys(CORNERS, 100), abs=30)
+
+
 def test_a_center_goal_is_not_sampled():
     """The episodes of a seed are those of before there were random goals."""
     generator = np.random.default_rng(5)
@@ -139,5 +150,7 @@ def test_factors_describe_the_observation():
 def test_unknown_layout():
     with pytest.raises(ValueError, match="spiral"):
         Nav2DEnv(layout="spiral")
-    with pytest.raises(ValueError, match="goal must be 'center' or 'random', got 'corner'"):
+    with pytest.raises(ValueError, match="goal must be 'center', 'random' or 'corners', got 'corner'"):
         Nav2DEnv(goal="corner")
+    with pytest.raises(ValueError, match="goal='corners' may be blocked in layout='maze'; give goal='random'"):
+        Nav2DEnv(layout="maze", goal="corners")

@@ -117,7 +117,7 @@ class PointMazeVectorEnv(BatchEnv):
     everything solid and lie outside the goal. Obstacles and start are sampled again until a corridor 0.5 m wide leads
     from the start to the goal, which is the center (0, 0). With ``goal="random"`` (``PointMazeRandomGoal-v0`` and its
     siblings) each episode samples the goal first, uniformly over the corners between pixels at least 1 m inside the
-    walls.
+    walls; with ``"corners"`` from (-3.5, -3.5), (3.5, -3.5), (-3.5, 3.5) and (3.5, 3.5).
 
     **Actions.** 0, 1, 2, 3 push with full force up, down, left, right; with ``continuous`` a force (x, y) in
     ``Box(-1, 1, (2,), float32)``, x to the right and y down, in units of 100 N per axis.
@@ -141,7 +141,7 @@ class PointMazeVectorEnv(BatchEnv):
     :param num_envs: number of copies, at least 1
     :param continuous: two-dimensional forces instead of four pushes
     :param reward_type: "step" or "sparse"
-    :param goal: "center" or "random"
+    :param goal: "center", "random" or "corners"
     :param momentum: keep the velocity from one step to the next
     :param n_threads: threads for the physics, at least 1; the results do not depend on it
     :param max_episode_steps: steps after which an episode is truncated, None for no limit
@@ -162,8 +162,8 @@ class PointMazeVectorEnv(BatchEnv):
         autoreset: bool = True,
         goal: str = "center",
     ) -> None:
-        if goal not in ("center", "random"):
-            raise ValueError(f"goal must be 'center' or 'random', got {goal!r}")
+        if goal not in ("center", "random", "corners"):
+            raise ValueError(f"goal must be 'center', 'random' or 'corners', got {goal!r}")
         if reward_type not in ("step", "sparse"):
             raise ValueError(f"reward_type must be 'step' or 'sparse', got {reward_type!r}")
         if not 1 <= n_threads <= MAX_THREADS:
@@ -219,7 +219,7 @@ class PointMazeVectorEnv(BatchEnv):
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i in indices:
-            layout = sample_layout(self._generators[i], self.goal == "random")
+            layout = sample_layout(self._generators[i], self.goal)
             solid, mark = layout.solid, goal_mask(layout.goal)
             self._obstacle_pos[i] = to_meters(layout.corners + OBSTACLE_PIXELS / 2)
             self._position[i] = layout.start

@@ -15,6 +15,7 @@ N_OBSTACLES = 20
 OBSTACLE_PIXELS = 8
 GOAL_RADIUS = 1.0  # m
 GOAL_MARK_PIXELS = 4
+CORNER_DISTANCE = 3.5  # m, of goals in the corners from the center along each axis
 
 _CENTER = IMAGE_SIZE // 2
 
@@ -67,7 +68,9 @@ def _start_blocks() -> int:
 
 # The goal lies in the middle of a square of this half side, which is free of obstacles and inside the walls.
 _REACH = int(GOAL_RADIUS * PIXELS_PER_METER)
-_LEAST_GOAL, _GREATEST_GOAL = WALL_PIXELS + _REACH, IMAGE_SIZE - WALL_PIXELS - _REACH
+_RANDOM_GOALS = np.arange(WALL_PIXELS + _REACH, IMAGE_SIZE - WALL_PIXELS - _REACH + 1)
+# Along each axis, with goals in the corners.
+_CORNER_GOALS = _CENTER + int(CORNER_DISTANCE * PIXELS_PER_METER) * np.array((-1, 1))
 _OBSTACLE = _square(0, 0, OBSTACLE_PIXELS)
 _FULL = (1 << IMAGE_SIZE**2) - 1
 _WALLS = _FULL & ~_square(WALL_PIXELS, WALL_PIXELS, IMAGE_SIZE - 2 * WALL_PIXELS)
@@ -111,18 +114,19 @@ def goal_mask(goal: tuple[int, int] = (_CENTER, _CENTER)) -> NDArray[np.bool_]:
 GOAL_MASK = goal_mask()
 
 
-def sample_layout(generator: np.random.Generator, random_goal: bool = False) -> Layout:
+def sample_layout(generator: np.random.Generator, goals: str = "center") -> Layout:
     """Sample the goal, if it is not the center, the obstacles and the start of an episode, until a corridor 0.5 m wide
     joins start and goal.
 
     :param generator: that of the environment
-    :param random_goal: whether the goal is sampled, uniformly over the corners between pixels that lie 1 m or more
-        inside the walls
+    :param goals: where the goal lies: "center"; "random", uniformly over the corners between pixels that lie 1 m or
+        more inside the walls; "corners", 3.5 m from the center along each axis
     """
     goal, choices_of_corners, start_blocks, shift = (_CENTER, _CENTER), _CORNERS, _START_BLOCKS, 0
     while True:
-        if random_goal:
-            column, row = generator.integers(_LEAST_GOAL, _GREATEST_GOAL + 1, size=2).tolist()
+        if goals != "center":
+            choices_of_goal = _CORNER_GOALS if goals == "corners" else _RANDOM_GOALS
+            column, row = generator.choice(choices_of_goal, size=2).tolist()
             goal, choices_of_corners = (column, row), _corner_choices((column, row))
             shift = _STRIDE * (row - _CENTER) + column - _CENTER
             # Within the walls, so that no bit is shifted into another row.

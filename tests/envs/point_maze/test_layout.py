@@ -90,3 +90,10 @@ def test_random_goals_lie_anywhere_inside_and_can_be_reached() -> None:
     assert goals.min() == -6.5 and goals.max() == 6.5 and np.array_equal(goals, np.round(goals * 4) / 4)
     assert (np.abs(goals.mean(axis=0)) < 4 * 3.82 / 20).all() and abs(np.corrcoef(goals.T)[0, 1]) < 0.2
     assert len(np.unique(goals, axis=0)) > 350
+
+
+def test_goals_in_the_corners() -> None:
+    env = PointMazeVectorEnv(num_envs=200, goal="corners")
+    env.reset(seed=0)
+    places, counts = np.unique(env.factors()["goal"], axis=0, return_counts=True)
+    assert places.tolist() == [[-3.5, -3.5], [-3.5, 3.5], [3.5, -3.5], [3.5, 3.5]] and counts.min() > 30
