@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_abisim import envs as _envs  # noqa: F401  (registers the environments)
 from sb3_abisim._version import __version__
-from sb3_abisim.registry import EnvTraits, register_method, register_network, register_reader, register_traits
+from sb3_abisim.registry import (
+    EnvTraits,
+    register_augmentation,
+    register_method,
+    register_network,
+    register_reader,
+    register_traits,
+)
 
 if TYPE_CHECKING:
     from sb3_abisim.data.collect import collect
@@ -91,6 +98,7 @@ __all__ = [
     "merge_encoder",
     "policy_kwargs",
     "pretrain",
+    "register_augmentation",
     "register_method",
     "register_network",
     "register_reader",

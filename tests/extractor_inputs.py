@@ -126,3 +126,13 @@ def build(
     policy = "CnnLstmPolicy" if name == "RecurrentPPO" else "CnnPolicy"
     env = RandomImages(continuous=name in ("SAC", "TD3", "TQC"))
     return algorithm(policy, env, seed=5, device="cpu", policy_kwargs=policy_kwargs, **settings)
+
+
+def dim(observations: th.Tensor, factor: float = 0.5) -> th.Tensor:
+    """An augmentation that is not random."""
+    return observations * factor
+
+
+def narrow(observations: th.Tensor) -> th.Tensor:
+    """No augmentation: another shape."""
+    return observations[:, :, 1:]

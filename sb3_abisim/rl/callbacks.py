@@ -68,7 +68,7 @@ class EncoderCallback(BaseCallback):
             state = "frozen" if extractor.frozen else "fine-tuned" if extractor.hash else "trained from scratch"
             print(
                 f"Encoder {name}: {type(extractor).__name__}, source {extractor.source}, {origin}, "
-                f"{extractor.n_parameters} parameters, {state}"
+                f"{extractor.n_parameters} parameters, {state}{extractor.extras}"
             )
         encoding = unwrap_vec_wrapper(self.training_env, VecEncodeObservations)
         if encoding is not None:

@@ -131,9 +131,13 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any], unfr
         hashes = [_hash_of(encoder, network) for encoder, network in encoders_of(asked_class, kwargs)] or [None]
         absent = None in hashes and issubclass(each_class, PretrainedExtractor)
         frozen = bool(kwargs.get("freeze", False)) and not unfreezes
-        here = {_name(each_class, frozen, None if absent else hash) for hash in hashes}
+        extras = each_class.asked_extras(kwargs)
+        here = {_name(each_class, frozen, None if absent else hash, extras) for hash in hashes}
     extractors = [extractor for _, extractor in find_extractors(model.policy)]
-    there = {_name(type(each), each.frozen and not unfreezes, None if absent else each.hash) for each in extractors}
+    there = {
+        _name(type(each), each.frozen and not unfreezes, None if absent else each.hash, each.extras)
+        for each in extractors
+    }
     if there != here:
         sides = (" and ".join(sorted(side)) or "none of our extractors" for side in (there, here))
         raise ValueError("it was trained with {}, not with {}".format(*sides))
@@ -146,5 +150,5 @@ def _hash_of(encoder: str, network: str | None) -> str | None:
         return None
 
 
-def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None) -> str:
-    return extractor.__name__ + f", hash {hash}" * (hash is not None) + ", frozen" * frozen
+def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None, extras: str) -> str:
+    return extractor.__name__ + f", hash {hash}" * (hash is not None) + ", frozen" * frozen + extras

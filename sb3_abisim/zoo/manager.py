@@ -8,8 +8,8 @@ For the environments of this package:
 
 For every environment:
 
-* ``--conf-file METHOD[=ENCODER][,frozen]`` keeps the hyperparameters and replaces the features extractor; frozen, it
-  puts ``VecEncodeObservations`` in its place;
+* ``--conf-file METHOD[=ENCODER][,frozen][,option=value]`` keeps the hyperparameters and replaces the features
+  extractor; frozen and without options, it puts ``VecEncodeObservations`` in its place;
 * ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
 * a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
@@ -233,7 +233,10 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 if not self.continue_training:
                     raise
         frozen = bool(kwargs.get("freeze", False)) and not unfreezes(self._used)
-        return MethodRecord(method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing)
+        options = {name: kwargs[name] for name in ("task_features_dim", "augment") if kwargs.get(name)}
+        return MethodRecord(
+            method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing, **options
+        )
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does, once the encoder's callback agrees.

@@ -33,6 +33,8 @@ ROOT = Path(__file__).resolve().parents[2]
     ("algo", "env_id", "method"),
     [
         ("ppo", "Nav2D-v0", "ssi,frozen"),
+        ("ppo", "Nav2D-v0", "ssi,frozen,task_features_dim=8,augment=random_shift"),
+        ("dqn", "Nav2D-v0", "drq"),
         ("ppo", "PointMaze-v0", "vanilla"),
         ("dqn", "Nav2D-v0", "abisim"),
         ("ppo", "ContinuousDistractorPointMaze-v0", "beta_vae"),
@@ -48,15 +50,15 @@ def test_train_and_enjoy(
     method: str,
 ) -> None:
     hash, word, encoder = "", method, tmp_path / "mine.safetensors"
-    if method != "vanilla":
-        name, comma, frozen = method.partition(",")
+    if method not in ("vanilla", "drq"):
+        name, comma, rest = method.partition(",")
         hash = write_encoder(encoder, env_id, name)
-        word = f"{name}={encoder}{comma}{frozen}"
+        word = f"{name}={encoder}{comma}{rest}"
     common = ["--algo", algo, "--env", env_id, "-f", str(tmp_path), "--num-threads", "1"]
     small = ["--eval-freq", "200", "--eval-episodes", "1", "-params", *SMALL[algo]]
     run(monkeypatch, "train", *common, "-n", "300", "--seed", "1", "--conf-file", word, *small)
     out = capsys.readouterr().out
-    state = "frozen" if method.endswith("frozen") else "fine-tuned" if hash else "trained from scratch"
+    state = "frozen" if "frozen" in method else "fine-tuned" if hash else "trained from scratch"
     # One line for each network with a separate encoder.
     assert out.count("Encoder ") == (2 if algo == "sac" else 1)
     assert f"hash {hash}" in out if hash else "random weights" in out
@@ -154,7 +156,10 @@ def test_values_reach_rl_zoo3(
 
 
 # In one word: a pair for the only argument of the callback.
-FINE_TUNED = '--env Nav2D-v0 -params callback:{{"sb3_abisim.EncoderCallback":{{"{}":{}}}}} n_envs:2 n_steps:32 batch_size:32'
+FINE_TUNED = (
+    '--env Nav2D-v0 -params callback:{{"sb3_abisim.EncoderCallback":{{"{}":{}}}}} '
+FINE_TUNED += "n_envs:2 n_steps:32 batch_size:32"
+)
 
 
 # rl-zoo3 leaves the monitor files open that it had opened before the mistake.

@@ -399,7 +399,10 @@ def test_records_say_what_a_run_used(manager: Any, tmp_path: Path) -> None:
     for config, kwargs, expected in (
         (f"ssi={path}", None, MethodRecord("ssi", False, str(path), hash, normalize)),
         (f"ssi={path},frozen", None, MethodRecord("ssi", True, str(path), hash, normalize)),
+        (f"ssi={path},frozen,task_features_dim=4", None, MethodRecord("ssi", True, str(path), hash, normalize, 4)),
         ("vanilla", None, MethodRecord("vanilla", False, None, None, normalize)),
+        ("drq", None, MethodRecord("drq", False, None, None, normalize)),
+        ("vanilla,augment=random_crop", None, MethodRecord("vanilla", False, None, None, normalize, 0, "random_crop")),
         (str(tmp_path / "custom.yml"), {}, MethodRecord(None, False, None, None, {})),
         (
             str(tmp_path / "custom.yml"),
