@@ -157,8 +157,7 @@ def test_values_reach_rl_zoo3(
 
 # In one word: a pair for the only argument of the callback.
 FINE_TUNED = (
-    '--env Nav2D-v0 -params callback:{{"sb3_abisim.EncoderCallback":{{"{}":{}}}}} '
-    "n_envs:2 n_steps:32 batch_size:32"
+    '--env Nav2D-v0 -params callback:{{"sb3_abisim.EncoderCallback":{{"{}":{}}}}} n_envs:2 n_steps:32 batch_size:32'
 )
 
 
