@@ -17,7 +17,6 @@ from sb3_abisim.rl.callbacks import EncoderCallback
 from sb3_abisim.rl.checks import check_trained_with, find_extractors
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.extractors import ActionBisimExtractor, EncoderExtractor, PretrainedExtractor, VanillaExtractor
-from sb3_abisim.rl.optimizers import EncoderLRAdam
 from sb3_abisim.rl.policy_kwargs import policy_kwargs
 from sb3_abisim.rl.task_features import make_task_network
 from sb3_abisim.rl.unfreeze import unfreeze_encoder
@@ -83,10 +82,6 @@ def test_ortho_init_reaches_them_and_not_the_encoder(path: Path) -> None:
 
 def test_they_are_no_part_of_the_encoder(path: Path) -> None:
     extractor = ActionBisimExtractor(SPACE, str(path), task_features_dim=8)
-    optimizer = EncoderLRAdam(extractor.parameters(), encoder_lr_factor=0.5)
-    rest, encoder = (group["params"] for group in optimizer.param_groups)
-    assert {id(p) for p in encoder} == {id(p) for p in extractor.encoder.parameters()}
-    assert {id(p) for p in rest} == {id(p) for p in extractor.task_features.parameters()} != set()
     plain = ActionBisimExtractor(SPACE, str(path))
     assert extractor.n_parameters == plain.n_parameters and th.equal(extractor.initial_weights, plain.initial_weights)
     with th.no_grad():
