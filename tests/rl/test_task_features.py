@@ -17,6 +17,7 @@ from sb3_abisim.rl.callbacks import EncoderCallback
 from sb3_abisim.rl.checks import check_trained_with, find_extractors
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.extractors import ActionBisimExtractor, EncoderExtractor, PretrainedExtractor, VanillaExtractor
+from sb3_abisim.rl.fine_tuning import _encoder_parameters
 from sb3_abisim.rl.policy_kwargs import policy_kwargs
 from sb3_abisim.rl.task_features import make_task_network
 from sb3_abisim.rl.unfreeze import unfreeze_encoder
@@ -82,6 +83,9 @@ def test_ortho_init_reaches_them_and_not_the_encoder(path: Path) -> None:
 
 def test_they_are_no_part_of_the_encoder(path: Path) -> None:
     extractor = ActionBisimExtractor(SPACE, str(path), task_features_dim=8)
+    policy = build("PPO", path, False, task_features_dim=8).policy
+    own_rate = {id(parameter) for parameter in _encoder_parameters(policy)}
+    assert own_rate == {id(parameter) for parameter in policy.features_extractor.encoder.parameters()}
     plain = ActionBisimExtractor(SPACE, str(path))
     assert extractor.n_parameters == plain.n_parameters and th.equal(extractor.initial_weights, plain.initial_weights)
     with th.no_grad():
