@@ -147,6 +147,14 @@ def test_at_a_step(tmp_path: Path, name: str, other_sharing: bool, capsys: pytes
         assert not frozen and moved
 
 
+def test_the_update_at_the_step_itself_trains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path / "e.safetensors", "BatchNorm")
+    for unfreeze_at in (16, 17):
+        build("PPO", path, True, network="BatchNorm").learn(32, callback=EncoderCallback(unfreeze_at=unfreeze_at))
+        is_at_16 = "Encoder: fine-tuned from step 16 on" in capsys.readouterr().out
+        assert is_at_16 == (unfreeze_at == 16)
+
+
 @pytest.mark.parametrize("name", ["PPO", "A2C", "DQN", "SAC", "TD3"])
 @pytest.mark.parametrize("before", [True, False])
 def test_continued_on_either_side(tmp_path: Path, name: str, before: bool) -> None:
