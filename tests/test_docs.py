@@ -12,6 +12,7 @@ import pytest
 
 import sb3_abisim
 from sb3_abisim.registry import methods
+from tools.make_environments_page import page as environments_page
 
 ROOT = Path(__file__).resolve().parent.parent
 LISTED = ["git", "ls-files", "-co", "--exclude-standard"]
@@ -49,6 +50,11 @@ def test_links_of_a_page_lead_somewhere_in_the_repository(page: str) -> None:
         assert target.is_relative_to(ROOT) and target.is_file(), f"{page}: {link.geturl()}"
         if link.fragment:
             assert link.fragment in anchors(target.read_text(encoding="utf-8")), f"{page}: {link.geturl()}"
+
+
+def test_the_page_of_environments_says_what_they_and_the_results_say() -> None:
+    made = environments_page()
+    assert made == (ROOT / "docs" / "environments.md").read_text(encoding="utf-8"), "tools/make_environments_page.py"
 
 
 @pytest.fixture(scope="module")
