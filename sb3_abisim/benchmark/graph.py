@@ -15,6 +15,7 @@ from sb3_abisim.common.cli import parse_pairs
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.config import FOLLOWING, load_config
 from sb3_abisim.registry import get_method, get_objective, get_traits, methods
+from sb3_abisim.zoo.auxiliary import joined
 from sb3_abisim.zoo.collect import preprocessing_entry
 from sb3_abisim.zoo.methods import MethodSpec, hyperparameters_entry
 from sb3_abisim.zoo.preprocessing import check_preprocessing, items, normalizes_observations, other_vec_wrappers
@@ -167,23 +168,26 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
         conf_file += f"={path.resolve() if path.is_file() else method.encoder}"
     elif inputs:
         conf_file += f"={inputs[0].output}"
+    if method.auxiliary is not None:
+        settings["auxiliary"] = method.auxiliary
     settings |= {
         "hyperparams": {**entry, "n_timesteps": n, **given},
         "eval_freq": eval_freq, "eval_episodes": plan.eval_episodes, "n_eval_envs": plan.n_eval_envs,
     }  # fmt: skip
-    frozen = ",frozen" if method.frozen else ""
+    options = joined(",frozen" if method.frozen else "", method.auxiliary)
     label += "-frozen" if method.frozen else ""
+    label += f"-auxiliary_{method.auxiliary.partition(':')[0]}" if method.auxiliary is not None else ""
     key = job_key("run", settings, inputs)
     # Runs that differ in nothing but seeds share a folder. A number, since the zoo's --exp-id takes one.
     family = f"runs/{_folder(env_id)}/{label}-{job_key('run', settings, inputs, without_seeds=True)[:8]}"
-    command = ["sb3_abisim", "train", "--algo", algo, "--env", env_id, "--conf-file", conf_file + frozen]
+    command = ["sb3_abisim", "train", "--algo", algo, "--env", env_id, "--conf-file", conf_file + options]
     command += ["-f", f"work/run-{key}", "-n", str(n), "--seed", str(seed), "--eval-freq", str(eval_freq)]
     command += ["--eval-episodes", str(plan.eval_episodes), "--n-eval-envs", str(plan.n_eval_envs)]
     command += ["--num-threads", str(plan.threads), "--device", plan.device, "--verbose", "0"]
     command += ["-params", *words] if words else []
     command += _packages(plan)
     output = f"{family}/{algo}/{_folder(env_id)}_{int(key[:10], 16)}"
-    title = f"{algo} {method.name}{frozen} {env_id} seed {seed}"
+    title = f"{algo} {method.name}{options} {env_id} seed {seed}"
     return Job("run", title, settings, inputs, tuple(command), output, f"{_folder(env_id)}.zip", n)
 
 
@@ -225,14 +229,18 @@ def run_labels(jobs: list[Job]) -> dict[str, str]:
     labels = dict.fromkeys((run.method for run in runs), "")
     for word in labels:
         method = MethodSpec.parse(word)
-        alike = [m for m in map(MethodSpec.parse, labels) if (m.name, m.frozen) == (method.name, method.frozen)]
+        alike = [
+            m for m in map(MethodSpec.parse, labels)
+            if (m.name, m.frozen, m.auxiliary) == (method.name, method.frozen, method.auxiliary)
+        ]  # fmt: skip
         paths = [_parts(m.encoder) for m in alike if m.encoder]
         end: tuple[str, ...] = ()
         if method.encoder and len(alike) > 1:
             parts = _parts(method.encoder)
             ends = (parts[-n:] for n in range(1, len(parts) + 1))
             end = next((end for end in ends if sum(p[-len(end) :] == end for p in paths) == 1), (method.encoder,))
-        labels[word] = method.name + "=" * bool(end) + "/".join(end) + ",frozen" * method.frozen
+        plain = method.name + "=" * bool(end) + "/".join(end) + ",frozen" * method.frozen
+        labels[word] = joined(plain, method.auxiliary)
     return {run.name: labels[run.method] for run in runs}
 
 

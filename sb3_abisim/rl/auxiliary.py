@@ -56,7 +56,7 @@ class AuxiliaryObjective(BaseCallback):
     :param k: steps between the two observations, or ``[fewest, most]``
     :param objective_kwargs: arguments of the objective; those that are not there are as in pretraining
     :param base_kwargs: arguments of its base's objective, likewise
-    :param seed: of heads and batches
+    :param seed: of heads and batches; None for the model's, where it has one, else 0
     :param verbose: as in Stable-Baselines3
     :raises ValueError: for settings that do not fit; when training starts, if there is no encoder to train
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
@@ -70,17 +70,17 @@ class AuxiliaryObjective(BaseCallback):
         weight: float = 1.0,
         learning_rate: float = 1e-3,
         update_interval: int = 256,
-        batch_size: int = 256,
+        batch_size: int = 128,
         k: int | list[int] | None = None,
         objective_kwargs: dict[str, Any] | None = None,
         base_kwargs: dict[str, Any] | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
         get_objective(objective)
         for name, number, least in (
-            ("update_interval", update_interval, 1), ("batch_size", batch_size, 2), ("seed", seed, 0),
+            ("update_interval", update_interval, 1), ("batch_size", batch_size, 2), ("seed", seed or 0, 0),
         ):  # fmt: skip
             if number < least:
                 raise ValueError(f"{name} must be at least {least}, got {number}")
@@ -97,7 +97,8 @@ class AuxiliaryObjective(BaseCallback):
         require_weights(self.model)
         self._refuse_another(self.locals.get("callback"))
         extractors = trained_extractors(self.model, self.training_env, self.weight)
-        entry, settings = self._settings(_env_id(self.training_env))
+        seed = self.model.seed if self.seed is None else self.seed
+        entry, settings = self._settings(_env_id(self.training_env), seed or 0)
         self._trainers = {
             name: AuxiliaryTrainer(extractor, self.model.action_space, settings, key, index)
             for index, (name, (extractor, key)) in enumerate(extractors.items())
@@ -121,7 +122,7 @@ class AuxiliaryObjective(BaseCallback):
     def _first(self) -> AuxiliaryTrainer:
         return next(iter(self._trainers.values()))
 
-    def _settings(self, env_id: str | None) -> tuple[str | None, AuxiliarySettings]:
+    def _settings(self, env_id: str | None, seed: int = 0) -> tuple[str | None, AuxiliarySettings]:
         entry, known = settings_entry(self.objective, env_id)
         base = get_method(self.objective).base
         base_known = {} if base is None else settings_entry(base, env_id)[1].get("objective_kwargs", {})
@@ -131,7 +132,7 @@ class AuxiliaryObjective(BaseCallback):
             learning_rate=self.learning_rate,
             batch_size=self.batch_size,
             k=known.get("k", 1) if self.k is None else self.k,
-            seed=self.seed,
+            seed=seed,
             objective_kwargs={**known.get("objective_kwargs", {}), **self.objective_kwargs},
             base_kwargs={**base_known, **self.base_kwargs},
         )

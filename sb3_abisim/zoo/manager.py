@@ -10,6 +10,7 @@ For every environment:
 
 * ``--conf-file METHOD[=ENCODER][,frozen]`` keeps the hyperparameters and replaces the features extractor; frozen, it
   puts ``VecEncodeObservations`` in its place;
+* ``,auxiliary=OBJECTIVE`` behind any of these, or alone, adds an ``AuxiliaryObjective`` to the callbacks;
 * ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
 * a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
@@ -29,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -39,6 +41,7 @@ from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, loa
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
+from sb3_abisim.zoo.auxiliary import auxiliary_of, split_auxiliary, with_auxiliary
 from sb3_abisim.zoo.methods import (
     MethodRecord,
     MethodSpec,
@@ -66,6 +69,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     """``rl_zoo3.exp_manager.ExperimentManager`` that knows methods; parameters as there."""
 
     algo: str
+    callbacks: list[BaseCallback]
     config: str
     custom_hyperparams: dict[str, Any] | None
     env_kwargs: dict[str, Any]
@@ -87,8 +91,10 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         :raises ValueError: for an unknown method, or hyperparameters that do not fit together
         """
         env_id = self.env_name.gym_id
-        is_default = Path(self.config).parent == zoo_hyperparams()
+        given, auxiliary = split_auxiliary(self.config)
+        is_default = not given or Path(given).parent == zoo_hyperparams()
         self._spec = None if is_default else MethodSpec.of_conf_file(self.config)
+        self.config = given
         if self.trial_id is not None and (self._spec is not None or env_id in ENV_IDS):
             raise ValueError(
                 "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
@@ -104,6 +110,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 replaced["policy"] = policy_of(self.algo, replaced["policy"])
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
+        if auxiliary is not None:
+            for each in (hyperparams, saved_hyperparams):
+                each["callback"] = with_auxiliary(each.get("callback"), auxiliary)
         self._check_normalize(hyperparams)
         self._set_batched_vec_env(hyperparams)
         self._set_eval_env_kwargs(hyperparams)
@@ -206,6 +215,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 self.params_path = f"{self.save_path}/{self.env_name}"
 
     def _make_record(self) -> MethodRecord:
+        return dataclasses.replace(self._record_encoder(), auxiliary=auxiliary_of(self._used))
+
+    def _record_encoder(self) -> MethodRecord:
         preprocessing = {key: self._used[key] for key in PREPROCESSING_KEYS if key in self._used}
         encoding = encoding_kwargs(self._used)
         if encoding is not None:
@@ -237,7 +249,8 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
 
         :param model: to train
         """
-        MethodExperimentManager.has_begun = True
+        # Behind all others, which look first whether they can do what they are asked to.
+        self.callbacks.append(_HasBegun())
         super().learn(model)
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
@@ -277,6 +290,16 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             self._hyperparams = _KeepExtractor(self._hyperparams)
         MethodExperimentManager.has_begun = True
         super().hyperparameters_optimization()
+
+
+class _HasBegun(BaseCallback):
+    """Notes that training has begun: errors from then on are no mistakes of the command."""
+
+    def _on_training_start(self) -> None:
+        MethodExperimentManager.has_begun = True
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class _KeepExtractor(dict[str, Any]):

@@ -16,6 +16,7 @@ from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, 
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
+from sb3_abisim.zoo.auxiliary import GRAMMAR, joined, split_auxiliary
 from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_stack_of, items
 
 ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
@@ -28,7 +29,7 @@ _CLASS_KEYS = ("features_extractor_class", "optimizer_class", "activation_fn")
 
 def grammar() -> str:
     """How a method spec is written, for messages."""
-    return f"METHOD[=ENCODER][,frozen] with METHOD one of {', '.join(methods())}"
+    return f"METHOD[=ENCODER][,frozen][,auxiliary={GRAMMAR}] with METHOD one of {', '.join(methods())}"
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,14 @@ class MethodSpec:
     :param encoder: a file, a shipped encoder's name or ``hf://owner/repository/file``; None for the shipped encoder of
         this method and the environment
     :param frozen: whether the weights stay as they are during RL
+    :param auxiliary: objective that trains the encoder, too (:mod:`sb3_abisim.zoo.auxiliary`); None for none
     :raises ValueError: for an unknown method, or an encoder or ``frozen`` for an untrained one
     """
 
     name: str
     encoder: str | None = None
     frozen: bool = False
+    auxiliary: str | None = None
 
     def __post_init__(self) -> None:
         if self.name not in methods():
@@ -58,13 +61,14 @@ class MethodSpec:
 
     @classmethod
     def parse(cls, text: str) -> "MethodSpec":
-        """Read ``METHOD[=ENCODER][,frozen]``.
+        """Read ``METHOD[=ENCODER][,frozen][,auxiliary=OBJECTIVE[:NAME=VALUE...]]``.
 
-        :param text: e.g. "ssi", "abisim,frozen" or "abisim=runs/mine.safetensors"
+        :param text: e.g. "ssi", "abisim,frozen", "abisim=runs/mine.safetensors" or "vanilla,auxiliary=ssi"
         :raises ValueError: for anything else
         """
+        text, auxiliary = split_auxiliary(text)
         head, equals, encoder = text.removesuffix(",frozen").partition("=")
-        return cls(head, encoder if equals else None, frozen=text.endswith(",frozen"))
+        return cls(head, encoder if equals else None, text.endswith(",frozen"), auxiliary)
 
     @classmethod
     def of_conf_file(cls, config: str) -> "MethodSpec | None":
@@ -75,6 +79,7 @@ class MethodSpec:
         """
         if re.split("[=,]", config)[0] in methods():
             return cls.parse(config)
+        config, _ = split_auxiliary(config)
         module = config.partition(".")[0]
         if not config.endswith((".yml", ".yaml", ".py")) and not (module and importlib.util.find_spec(module)):
             raise ValueError(
@@ -187,6 +192,8 @@ class MethodRecord:
     :param encoder: path or name of the encoder file; None without one
     :param encoder_hash: sha256 of the encoder file; None without one
     :param preprocessing: hyperparameters that stand between the environment and the encoder, where they are given
+    :param auxiliary: objective that trained the encoder, too (:mod:`sb3_abisim.zoo.auxiliary`); None without one, as in
+        all records of before
     """
 
     method: str | None
@@ -194,19 +201,21 @@ class MethodRecord:
     encoder: str | None
     encoder_hash: str | None
     preprocessing: dict[str, Any]
+    auxiliary: str | None = None
 
     @property
     def label(self) -> str | None:
-        """What reports call it: "abisim", "abisim,frozen"; None for no method."""
-        return None if self.method is None else self.method + ",frozen" * self.frozen
+        """What reports call it: "abisim", "abisim,frozen", "vanilla,auxiliary=ssi"; None for no method."""
+        return None if self.method is None else joined(self.method + ",frozen" * self.frozen, self.auxiliary)
 
     def write(self, folder: str | Path) -> None:
         """Write it into the folder of ``config.yml``.
 
         :param folder: exists
         """
+        fields = {name: value for name, value in asdict(self).items() if name != "auxiliary" or value is not None}
         # Wrappers of a Python configuration may be classes.
-        text = json.dumps(asdict(self), indent=1, sort_keys=True, default=str) + "\n"
+        text = json.dumps(fields, indent=1, sort_keys=True, default=str) + "\n"
         write_atomic(Path(folder) / RECORD_NAME, lambda file: file.write(text.encode()))
 
     @classmethod
@@ -221,7 +230,7 @@ class MethodRecord:
             return None
         try:
             record = cls(**json.loads(path.read_bytes()))
-            texts = record.method, record.encoder, record.encoder_hash
+            texts = record.method, record.encoder, record.encoder_hash, record.auxiliary
             if not all(value is None or (isinstance(value, str) and value.isprintable()) for value in texts):
                 raise TypeError("a name is no text")
             if not isinstance(record.frozen, bool) or not isinstance(record.preprocessing, dict):
