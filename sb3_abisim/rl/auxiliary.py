@@ -35,8 +35,8 @@ class AuxiliaryObjective(BaseCallback):
     ``goal_progress``) gets one that begins with the encoder's weights and learns beside it, by its own loss.
 
     Updates are made when a rollout ends, before RL trains on it. On-policy algorithms give the rollout, and where it is
-    short the newest rollouts that hold twice ``batch_size`` steps; off-policy ones give the replay buffer, once they
-    learn themselves. Heads, targets, Adam's averages and random numbers are saved with the model. A run that is
+    short the newest rollouts that hold 512 steps, or twice ``batch_size``. Off-policy ones give the replay buffer, once
+    they learn themselves. Heads, targets, Adam's averages and random numbers are saved with the model. A run that is
     continued with this callback goes on exactly; one without it keeps them.
 
     What is None comes from the objective's settings for pretraining (``hyperparams/pretrain/``), where those have it.

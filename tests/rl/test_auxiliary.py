@@ -1,6 +1,8 @@
 """What an auxiliary objective trains, and what it leaves alone."""
 
+import re
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.registry import get_objective, methods
 from sb3_abisim.rl.auxiliary import AuxiliaryObjective
+from sb3_abisim.rl.auxiliary_state import KEY
 from sb3_abisim.rl.checks import find_extractors
 
 VARIANTS = [(name, False) for name in ALGORITHMS] + [(name, True) for name in SHARING]
@@ -358,6 +361,16 @@ def test_settings_come_from_pretraining_where_none_are_given() -> None:
     assert entry == "default"
     assert settings.base_kwargs == {"l1_penalty": 0.01, "adaptive": "paper", "delta_scale": 2.0}
     assert AuxiliaryObjective("recorder")._settings(None)[0] is None
+
+
+def test_the_example_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "while_rl_runs.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    assert len(code.splitlines()) <= 10
+    assert "100_000" in code
+    monkeypatch.chdir(tmp_path)
+    exec(code.replace("100_000", "1_000"), {})
+    assert KEY in "".join(sb3.PPO.load("agent").policy.state_dict())
 
 
 @pytest.mark.parametrize(("kwargs", "message"), [
