@@ -120,6 +120,7 @@ def test_weight_0_is_plain_stable_baselines3(name: str, objective: str) -> None:
             trainer = next(iter(callback._trainers.values()))
             assert trainer.n_updates > 3
             assert trainer._optimizer.state, "heads learn"
+            assert not any(name.startswith("encoder.") for name in trainer._trained)
     (plain, *rest), (with_callback, *others) = outcomes
     assert plain.keys() == with_callback.keys()
     assert all(th.equal(plain[n], with_callback[n]) for n in plain)
@@ -148,6 +149,13 @@ def test_weight_scales_the_encoders_learning_rate() -> None:
         (there, _), (here, _) = before[0], after[0]
         name = "features_extractor.encoder.layers.1.weight"
         assert float((here[name] - there[name]).abs().max()) == pytest.approx(weight * 1e-3, rel=1e-3)
+
+
+def test_off_policy_it_learns_once_the_algorithm_does() -> None:
+    for learning_starts, learns in ((1000, False), (4, True)):
+        callback = AuxiliaryObjective("ssi", **SMALL)
+        build("DQN", learning_starts=learning_starts).learn(100, callback)
+        assert (callback._trainers["q_net"].n_updates > 0) == learns
 
 
 @pytest.mark.parametrize("objective", ["abisim", "goal_progress"])

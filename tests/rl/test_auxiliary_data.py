@@ -20,7 +20,7 @@ from auxiliary_inputs import (
 from extractor_inputs import ALGORITHMS
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
 
 from sb3_abisim.rl.auxiliary import AuxiliaryObjective
 from sb3_abisim.rl.auxiliary_data import ReplaySteps, RolloutHistory, RolloutSteps, Steps, sample_batch
@@ -77,6 +77,27 @@ def test_continuous_actions_of_ppo_are_those_that_the_environment_got() -> None:
     _, _, actions = seen()
     assert actions.min() >= 2
     assert (actions == 2).any()
+
+
+class OneArray(VecEnvWrapper):
+    """Hands out every terminal observation in the same array."""
+
+    def reset(self) -> Any:
+        self._array = np.zeros(self.observation_space.shape, np.uint8)
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for info in infos:
+            if "terminal_observation" in info:
+                self._array[:] = info["terminal_observation"]
+                info["terminal_observation"] = self._array
+        return observations, rewards, dones, infos
+
+
+def test_a_terminal_observation_is_kept_as_it_was() -> None:
+    build("PPO", OneArray(make_envs(1))).learn(600, AuxiliaryObjective("recorder", update_interval=8, batch_size=64))
+    require_true_transitions(1, False, 5)
 
 
 def test_a_range_of_steps() -> None:

@@ -69,8 +69,7 @@ def test_n_and_n_steps_are_2_n(name: str, objective: str, tmp_path: Path) -> Non
     """Bit for bit, heads, targets, Adam, counters and random numbers included."""
     n = 96
     once = build(name, make_envs(2, continuous=name in CONTINUOUS))
-    once.learn(n, callback_of(objective))
-    once.learn(n, callback_of(objective), reset_num_timesteps=False)
+    once.learn(2 * n, callback_of(objective))
     twice = build(name, make_envs(2, continuous=name in CONTINUOUS))
     twice.learn(n, callback_of(objective))
     twice = through_a_file(twice, tmp_path)
