@@ -107,9 +107,12 @@ class AuxiliaryObjective(BaseCallback):
         # Environment steps since the last update, and on-policy what the newest short rollouts showed.
         self._pending = int(first.extra.get("pending", 0))
         self._history = RolloutHistory(max(2 * self.batch_size, N_PREPARE))
-        saved = {n.removeprefix(_HISTORY): t for n, t in first.extra_tensors.items() if n.startswith(_HISTORY)}
-        if saved:
-            self._history.parts = [RolloutSteps.from_tensors(saved)]
+        saved: dict[int, dict[str, th.Tensor]] = {}
+        for name, tensor in first.extra_tensors.items():
+            if name.startswith(_HISTORY):
+                number, _, rest = name.removeprefix(_HISTORY).partition(".")
+                saved.setdefault(int(number), {})[rest] = tensor
+        self._history.parts = [RolloutSteps.from_tensors(saved[number]) for number in sorted(saved)]
         self._n_new = 0
         self._begin_rollout()
         print(
@@ -209,10 +212,12 @@ class AuxiliaryObjective(BaseCallback):
         first.keep_later(self._history_tensors)
 
     def _history_tensors(self) -> dict[str, th.Tensor]:
-        if not self._history.parts:
-            return {}
-        joined = RolloutSteps.join(self._history.parts)
-        return {f"{_HISTORY}{name}": tensor for name, tensor in joined.to_tensors().items()}
+        # Each by itself: they are dropped one by one.
+        return {
+            f"{_HISTORY}{number}.{name}": tensor
+            for number, part in enumerate(self._history.parts)
+            for name, tensor in part.to_tensors().items()
+        }
 
 
 def trained_extractors(

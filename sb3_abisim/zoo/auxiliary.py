@@ -12,7 +12,6 @@ from sb3_abisim.zoo.preprocessing import class_name, items
 
 AUXILIARY_CALLBACK = "sb3_abisim.AuxiliaryObjective"
 GRAMMAR = "OBJECTIVE[:NAME=VALUE...]"
-_OPTION = ",auxiliary="
 # Arguments whose entries are set one by one.
 _NESTED = ("objective_kwargs", "base_kwargs")
 
@@ -78,30 +77,3 @@ def with_auxiliary(callback: Any, text: str) -> list[Any]:
     name = AUXILIARY_CALLBACK.rpartition(".")[2]
     others = [item for item in items(callback) if class_name(item) != name]
     return [*others, {AUXILIARY_CALLBACK: parse_auxiliary(text)}]
-
-
-def split_auxiliary(config: str) -> tuple[str, str | None]:
-    """What stands before ``,auxiliary=`` in the word after ``--conf-file``, and what stands behind it.
-
-    :param config: e.g. "abisim,frozen", "mine.yml,auxiliary=ssi", or ",auxiliary=ssi" for the default
-    :return: the rest, and the auxiliary objective; None without one
-    :raises ValueError: for an auxiliary objective beside ``,frozen``
-    """
-    rest, option, text = config.partition(_OPTION)
-    if not option:
-        return config, None
-    if rest.endswith(",frozen") or text.endswith(",frozen"):
-        raise ValueError(
-            f"{config!r}: an encoder that is frozen stands in the environment, where no auxiliary objective trains it; "
-            "leave ,frozen or the auxiliary objective out"
-        )
-    return rest, auxiliary_text(parse_auxiliary(text))
-
-
-def joined(config: str, auxiliary: str | None) -> str:
-    """The inverse of :func:`split_auxiliary`.
-
-    :param config: what ``--conf-file`` names, "" for the default
-    :param auxiliary: None without one
-    """
-    return config if auxiliary is None else f"{config}{_OPTION}{auxiliary}"

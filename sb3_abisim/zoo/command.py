@@ -10,10 +10,10 @@ import gymnasium as gym
 
 from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs
 from sb3_abisim.registry import is_import_path
-from sb3_abisim.zoo.auxiliary import GRAMMAR, joined, split_auxiliary
+from sb3_abisim.zoo.auxiliary import GRAMMAR, parse_auxiliary
 from sb3_abisim.zoo.guard import GUARDED, guarded
 from sb3_abisim.zoo.manager import MethodExperimentManager
-from sb3_abisim.zoo.methods import grammar
+from sb3_abisim.zoo.methods import grammar, split_options
 
 # The commands of rl-zoo3 by name: the module, and an example.
 SCRIPTS = {
@@ -146,10 +146,10 @@ def _with_auxiliary(words: Sequence[str]) -> list[str]:
     configs = found["--conf-file"][-1:]
     for auxiliary in found[_AUXILIARY]:
         config = configs[0] if configs else ""
-        if split_auxiliary(config)[1] is not None:
+        if "auxiliary" in split_options(config)[1]:
             raise ValueError(f"--conf-file {config} names an auxiliary objective already; leave {_AUXILIARY} out")
-        split_auxiliary(joined(config, auxiliary))
-        configs = [joined(config, auxiliary)]
+        parse_auxiliary(auxiliary)
+        configs = [f"{config},auxiliary={auxiliary}"]
     return rest + [word for config in configs for word in ("--conf-file", config)]
 
 

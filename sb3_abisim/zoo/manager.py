@@ -8,9 +8,9 @@ For the environments of this package:
 
 For every environment:
 
-* ``--conf-file METHOD[=ENCODER][,frozen]`` keeps the hyperparameters and replaces the features extractor; frozen, it
-  puts ``VecEncodeObservations`` in its place;
-* ``,auxiliary=OBJECTIVE`` behind any of these, or alone, adds an ``AuxiliaryObjective`` to the callbacks;
+* ``--conf-file METHOD[=ENCODER][,frozen][,option=value]`` keeps the hyperparameters and replaces the features
+  extractor; frozen and without options, it puts ``VecEncodeObservations`` in its place;
+* ``,auxiliary=OBJECTIVE`` behind any of these, a file or nothing adds an ``AuxiliaryObjective`` to the callbacks;
 * ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
 * a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
@@ -41,7 +41,7 @@ from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, loa
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
-from sb3_abisim.zoo.auxiliary import auxiliary_of, split_auxiliary, with_auxiliary
+from sb3_abisim.zoo.auxiliary import auxiliary_of, with_auxiliary
 from sb3_abisim.zoo.methods import (
     MethodRecord,
     MethodSpec,
@@ -50,6 +50,8 @@ from sb3_abisim.zoo.methods import (
     hyperparameters_file,
     policy_of,
     resolve_classes,
+    split_options,
+    unfreezes,
     zoo_hyperparams,
 )
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
@@ -91,10 +93,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         :raises ValueError: for an unknown method, or hyperparameters that do not fit together
         """
         env_id = self.env_name.gym_id
-        given, auxiliary = split_auxiliary(self.config)
-        is_default = not given or Path(given).parent == zoo_hyperparams()
-        self._spec = None if is_default else MethodSpec.of_conf_file(self.config)
-        self.config = given
+        self._spec = MethodSpec.of_conf_file(self.config)
+        self.config, options = split_options(self.config)
+        is_default = not self.config or Path(self.config).parent == zoo_hyperparams()
         if self.trial_id is not None and (self._spec is not None or env_id in ENV_IDS):
             raise ValueError(
                 "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
@@ -110,9 +111,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 replaced["policy"] = policy_of(self.algo, replaced["policy"])
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
-        if auxiliary is not None:
+        if "auxiliary" in options:
             for each in (hyperparams, saved_hyperparams):
-                each["callback"] = with_auxiliary(each.get("callback"), auxiliary)
+                each["callback"] = with_auxiliary(each.get("callback"), options["auxiliary"])
         self._check_normalize(hyperparams)
         self._set_batched_vec_env(hyperparams)
         self._set_eval_env_kwargs(hyperparams)
@@ -241,8 +242,11 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
-        frozen = bool(kwargs.get("freeze", False))
-        return MethodRecord(method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing)
+        frozen = bool(kwargs.get("freeze", False)) and not unfreezes(self._used)
+        options = {name: kwargs[name] for name in ("task_features_dim", "augment") if kwargs.get(name)}
+        return MethodRecord(
+            method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing, **options
+        )
 
     def learn(self, model: BaseAlgorithm) -> None:
         """As rl-zoo3 does.
@@ -273,7 +277,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         asked = hyperparams.get("policy_kwargs") or {}
         model: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
         try:
-            check_trained_with(model, asked)
+            check_trained_with(model, asked, unfreezes(self._used))
         except ValueError as error:
             env.close()
             raise ValueError(f"cannot continue {self.trained_agent}: {error}; give the same --conf-file") from error

@@ -4,7 +4,7 @@ import importlib
 import importlib.util
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,23 +13,28 @@ from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.yaml_text import read_yaml_file
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
-from sb3_abisim.registry import get_method, methods
+from sb3_abisim.registry import get_augmentation, get_method, methods
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
-from sb3_abisim.zoo.auxiliary import GRAMMAR, joined, split_auxiliary
+from sb3_abisim.zoo.auxiliary import auxiliary_text, parse_auxiliary
 from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_stack_of, items
 
 ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
 ENCODER_CALLBACK = "sb3_abisim.EncoderCallback"
 # Beside config.yml in a run's folder.
 RECORD_NAME = "method.json"
+# What may stand after a method as ",name=value", in this order, and the type of the value.
+_OPTIONS: dict[str, Callable[[str], Any]] = {"task_features_dim": int, "augment": str, "auxiliary": str}
+# Of these, what stands in the entry's callbacks and so behind a file, too; all others are arguments of the extractor.
+_CALLBACK_OPTIONS = ("auxiliary",)
 # Of policy_kwargs: what a YAML names by its dotted path.
 _CLASS_KEYS = ("features_extractor_class", "optimizer_class", "activation_fn")
 
 
 def grammar() -> str:
     """How a method spec is written, for messages."""
-    return f"METHOD[=ENCODER][,frozen][,auxiliary={GRAMMAR}] with METHOD one of {', '.join(methods())}"
+    options = "".join(f"[,{name}=VALUE]" for name in _OPTIONS)
+    return f"METHOD[=ENCODER][,frozen]{options} with METHOD one of {', '.join(methods())}"
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,8 @@ class MethodSpec:
     :param encoder: a file, a shipped encoder's name or ``hf://owner/repository/file``; None for the shipped encoder of
         this method and the environment
     :param frozen: whether the weights stay as they are during RL
+    :param task_features_dim: size of the trainable network beside the encoder, 0 for none
+    :param augment: name of an augmentation; None for that of the method
     :param auxiliary: objective that trains the encoder, too (:mod:`sb3_abisim.zoo.auxiliary`); None for none
     :raises ValueError: for an unknown method, or an encoder or ``frozen`` for an untrained one
     """
@@ -47,6 +54,8 @@ class MethodSpec:
     name: str
     encoder: str | None = None
     frozen: bool = False
+    task_features_dim: int = 0
+    augment: str | None = None
     auxiliary: str | None = None
 
     def __post_init__(self) -> None:
@@ -54,21 +63,57 @@ class MethodSpec:
             raise ValueError(f"unknown method {self.name!r}; give {grammar()}")
         if self.encoder == "":
             raise ValueError(f"no encoder after '{self.name}='; give {grammar()}")
+        if self.task_features_dim < 0:
+            raise ValueError(f"task_features_dim must be at least 0, got {self.task_features_dim}; give {grammar()}")
+        if self.augment is not None:
+            get_augmentation(self.augment)
+        if self.auxiliary is not None:
+            self._check_auxiliary(self.auxiliary)
         if not get_method(self.name).has_encoder_file and (self.encoder is not None or self.frozen):
             raise ValueError(
                 f"{self.name!r} trains its network from scratch: it takes neither an encoder nor ',frozen'"
             )
 
+    def _check_auxiliary(self, text: str) -> None:
+        kwargs = parse_auxiliary(text)
+        if self.frozen and kwargs.get("weight") != 0:
+            raise ValueError(
+                f"',frozen' keeps the encoder as it is, and auxiliary={text} would train it; leave one of the two out, "
+                "or give weight=0, which measures only"
+            )
+        # The same settings in the same words: they decide which runs are alike.
+        object.__setattr__(self, "auxiliary", auxiliary_text(kwargs))
+
     @classmethod
     def parse(cls, text: str) -> "MethodSpec":
-        """Read ``METHOD[=ENCODER][,frozen][,auxiliary=OBJECTIVE[:NAME=VALUE...]]``.
+        """Read ``METHOD[=ENCODER][,frozen][,option=value]``, in any order of what follows a comma.
 
-        :param text: e.g. "ssi", "abisim,frozen", "abisim=runs/mine.safetensors" or "vanilla,auxiliary=ssi"
+        :param text: e.g. "ssi", "abisim,frozen,task_features_dim=64" or "abisim=runs/mine.safetensors"
         :raises ValueError: for anything else
         """
-        text, auxiliary = split_auxiliary(text)
-        head, equals, encoder = text.removesuffix(",frozen").partition("=")
-        return cls(head, encoder if equals else None, text.endswith(",frozen"), auxiliary)
+        rest, given = split_options(text)
+        head, equals, encoder = rest.partition("=")
+        return cls(head, encoder if equals else None, **given)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What it says beyond method, encoder and ``frozen``, by name."""
+        return _given_options(self)
+
+    @property
+    def extractor_options(self) -> dict[str, Any]:
+        """Those of :attr:`options` that are arguments of the features extractor."""
+        return {name: value for name, value in self.options.items() if name not in _CALLBACK_OPTIONS}
+
+    @property
+    def suffix(self) -> str:
+        """What stands behind method and encoder: ",frozen,task_features_dim=64"."""
+        return _suffix(self)
+
+    @property
+    def embeds_in_env(self) -> bool:
+        """Whether ``VecEncodeObservations`` embeds each observation once: nothing else needs the observation."""
+        return self.frozen and not self.options
 
     @classmethod
     def of_conf_file(cls, config: str) -> "MethodSpec | None":
@@ -79,9 +124,16 @@ class MethodSpec:
         """
         if re.split("[=,]", config)[0] in methods():
             return cls.parse(config)
-        config, _ = split_auxiliary(config)
+        config, given = split_options(config)
+        others = [name for name in given if name not in _CALLBACK_OPTIONS]
+        if others:
+            raise ValueError(f"--conf-file {config!r} is no method, which {', '.join(others)} need; give {grammar()}")
         module = config.partition(".")[0]
-        if not config.endswith((".yml", ".yaml", ".py")) and not (module and importlib.util.find_spec(module)):
+        if (
+            config
+            and not config.endswith((".yml", ".yaml", ".py"))
+            and not (module and importlib.util.find_spec(module))
+        ):
             raise ValueError(
                 f"--conf-file {config!r} is no YAML or Python file, module or method; a method is {grammar()}"
             )
@@ -93,7 +145,8 @@ class MethodSpec:
         :param entry: of a zoo YAML
         :param given: hyperparameters that the user sets
         :return: ``policy_kwargs``, unless the entry gives them as a text: :meth:`policy_kwargs` takes them once rl-zoo3
-            has evaluated it; ``policy`` and, for a frozen encoder, ``vec_env_wrapper``; ``frame_stack``, where a frozen
+            has evaluated it; ``policy`` and, for a frozen encoder without task features and augmentation,
+            ``vec_env_wrapper``; ``frame_stack``, where a frozen
             encoder's observations are stacked before it; ``callback``, where the entry has no ``EncoderCallback``
         :raises ValueError: when the method has no encoder, the policy takes none, the method sets what the user sets,
             or a frozen encoder would be shown other stacks than in pretraining
@@ -105,10 +158,10 @@ class MethodSpec:
             encoder = _encoder_name(kwargs)
             replaced["policy_kwargs"] = self.policy_kwargs(kwargs)
         file = self._file(encoder)
-        if self.frozen and _image_key(file) is None:
+        if self.embeds_in_env and _image_key(file) is None:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
             replaced["vec_env_wrapper"] = [*items(entry.get("vec_env_wrapper")), wrapper]
-        if self.frozen or "policy" not in given:
+        if self.embeds_in_env or "policy" not in given:
             replaced["policy"] = self._policy(str(entry.get("policy")), _image_key(file))
         for name in sorted({"policy_kwargs", *replaced} & set(given)):
             raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
@@ -140,12 +193,16 @@ class MethodSpec:
             check_objective(file, self.name)
             replaced["features_extractor_class"] = f"sb3_abisim.{CombinedEncoderExtractor.__name__}"
             arguments = {"encoders": {key: self._encoder(shipped)}, "networks": {key: stored_network(file)}}
-            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen}
-        elif not self.frozen:
+            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen, **self.extractor_options}
+        elif not self.embeds_in_env:
             replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
+            arguments = self.extractor_options
             if method.has_encoder_file:
-                arguments = {} if file is None else network_arguments(file)
-                replaced["features_extractor_kwargs"] = {"encoder": self._encoder(shipped), **arguments}
+                network = {} if file is None else network_arguments(file)
+                frozen = {"freeze": True} if self.frozen else {}
+                arguments = {"encoder": self._encoder(shipped), **network, **frozen, **arguments}
+            if arguments:
+                replaced["features_extractor_kwargs"] = arguments
         return replaced
 
     def _encoder(self, shipped: str | None) -> str:
@@ -154,7 +211,7 @@ class MethodSpec:
         if shipped is None:
             raise ValueError(
                 f"no encoder ships for this environment; pretrain one and give its file: --conf-file {self.name}=FILE"
-                + ",frozen" * self.frozen
+                + self.suffix
             )
         return f"{shipped.rpartition('/')[0]}/{self.name}"
 
@@ -172,7 +229,7 @@ class MethodSpec:
         if image_key is not None:
             return re.sub("Mlp|Cnn", "MultiInput", policy)
         # An entry for vectors, as rl-zoo3's "default" is, has the policy without an extractor for images.
-        wrong, right = ("Cnn", "Mlp") if self.frozen else ("Mlp", "Cnn")
+        wrong, right = ("Cnn", "Mlp") if self.embeds_in_env else ("Mlp", "Cnn")
         replaced = policy.replace(wrong, right)
         # A dotted path is a custom policy.
         if right not in replaced and "." not in replaced:
@@ -192,8 +249,9 @@ class MethodRecord:
     :param encoder: path or name of the encoder file; None without one
     :param encoder_hash: sha256 of the encoder file; None without one
     :param preprocessing: hyperparameters that stand between the environment and the encoder, where they are given
-    :param auxiliary: objective that trained the encoder, too (:mod:`sb3_abisim.zoo.auxiliary`); None without one, as in
-        all records of before
+    :param task_features_dim: size of the trainable network beside the encoder, 0 for none
+    :param augment: name of an augmentation; None for that of the method
+    :param auxiliary: objective that trained the encoder, too (:mod:`sb3_abisim.zoo.auxiliary`); None for none
     """
 
     method: str | None
@@ -201,21 +259,22 @@ class MethodRecord:
     encoder: str | None
     encoder_hash: str | None
     preprocessing: dict[str, Any]
+    task_features_dim: int = 0
+    augment: str | None = None
     auxiliary: str | None = None
 
     @property
     def label(self) -> str | None:
-        """What reports call it: "abisim", "abisim,frozen", "vanilla,auxiliary=ssi"; None for no method."""
-        return None if self.method is None else joined(self.method + ",frozen" * self.frozen, self.auxiliary)
+        """What reports call it: "abisim", "abisim,frozen,task_features_dim=64"; None for no method."""
+        return None if self.method is None else self.method + _suffix(self)
 
     def write(self, folder: str | Path) -> None:
         """Write it into the folder of ``config.yml``.
 
         :param folder: exists
         """
-        fields = {name: value for name, value in asdict(self).items() if name != "auxiliary" or value is not None}
         # Wrappers of a Python configuration may be classes.
-        text = json.dumps(fields, indent=1, sort_keys=True, default=str) + "\n"
+        text = json.dumps(asdict(self), indent=1, sort_keys=True, default=str) + "\n"
         write_atomic(Path(folder) / RECORD_NAME, lambda file: file.write(text.encode()))
 
     @classmethod
@@ -230,14 +289,43 @@ class MethodRecord:
             return None
         try:
             record = cls(**json.loads(path.read_bytes()))
-            texts = record.method, record.encoder, record.encoder_hash, record.auxiliary
+            texts = record.method, record.encoder, record.encoder_hash, record.augment, record.auxiliary
             if not all(value is None or (isinstance(value, str) and value.isprintable()) for value in texts):
                 raise TypeError("a name is no text")
             if not isinstance(record.frozen, bool) or not isinstance(record.preprocessing, dict):
                 raise TypeError("frozen is no bool, or preprocessing no mapping")
+            if type(record.task_features_dim) is not int:
+                raise TypeError("task_features_dim is no whole number")
             return record
         except (ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{path} is damaged ({error}); leave the run out, or copy the file again") from error
+
+
+def split_options(text: str) -> tuple[str, dict[str, Any]]:
+    """What stands before ``,frozen`` and ``,option=value`` in the word after ``--conf-file``, and these.
+
+    :param text: e.g. "abisim=mine.safetensors,frozen", "mine.yml,auxiliary=ssi"
+    :raises ValueError: for an option that is given twice, or a value that is none of its
+    """
+    rest, given = text, dict[str, Any]()
+    # From the end: a path may hold commas and equals signs, and so may a value.
+    while match := re.fullmatch(rf"(.*),(?:(frozen)|({'|'.join(_OPTIONS)})=(.*))", rest):
+        rest, frozen, option, value = match.groups()
+        if (frozen or option) in given:
+            raise ValueError(f"{text!r} says {frozen or option} twice; give {grammar()}")
+        try:
+            given[frozen or option] = True if frozen else _OPTIONS[option](value)
+        except ValueError as error:
+            raise ValueError(f"{option} takes no {value!r} in {text!r}; give {grammar()}") from error
+    return rest, given
+
+
+def _given_options(given: MethodSpec | MethodRecord) -> dict[str, Any]:
+    return {name: value for name in _OPTIONS if (value := getattr(given, name))}
+
+
+def _suffix(given: MethodSpec | MethodRecord) -> str:
+    return ",frozen" * given.frozen + "".join(f",{name}={value}" for name, value in _given_options(given).items())
 
 
 def hyperparameters_file(algo: str, env_id: str) -> Path | None:
@@ -349,6 +437,17 @@ def encoding_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any] | None:
             kwargs: dict[str, Any] = next(iter(wrapper.values()))
             return kwargs
     return None
+
+
+def unfreezes(hyperparams: Mapping[str, Any]) -> bool:
+    """Whether the ``EncoderCallback`` of a zoo entry unfreezes a frozen encoder at some step.
+
+    :param hyperparams: of a zoo entry, or of a run's ``config.yml``
+    """
+    for item in items(hyperparams.get("callback")):
+        if isinstance(item, Mapping) and class_name(item) == ENCODER_CALLBACK.rpartition(".")[2]:
+            return (next(iter(item.values())) or {}).get("unfreeze_at") is not None
+    return False
 
 
 def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:

@@ -14,8 +14,8 @@ from zoo_inputs import SMALL, run, write_encoder
 from sb3_abisim.benchmark.graph import build, run_labels
 from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.zoo import manager as manager_module
-from sb3_abisim.zoo.auxiliary import auxiliary_of, auxiliary_text, parse_auxiliary, split_auxiliary, with_auxiliary
-from sb3_abisim.zoo.methods import ENCODER_CALLBACK, MethodRecord, MethodSpec
+from sb3_abisim.zoo.auxiliary import auxiliary_of, auxiliary_text, parse_auxiliary, with_auxiliary
+from sb3_abisim.zoo.methods import ENCODER_CALLBACK, MethodRecord, MethodSpec, split_options
 from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.run_files import read_yaml
 from sb3_abisim.zoo.runs import read_run
@@ -57,16 +57,35 @@ def test_wrong_words(text: str, message: str) -> None:
 
 def test_method_specs_take_it() -> None:
     spec = MethodSpec.parse("abisim=a,b.safetensors,auxiliary=abisim:weight=0.50")
-    assert spec == MethodSpec("abisim", "a,b.safetensors", False, "abisim:weight=0.5")
+    assert spec == MethodSpec("abisim", "a,b.safetensors", auxiliary="abisim:weight=0.5")
     assert MethodSpec.parse("vanilla,auxiliary=ssi") == MethodSpec("vanilla", auxiliary="ssi")
-    for text in ("abisim,frozen,auxiliary=ssi", "abisim,auxiliary=ssi,frozen"):
-        with pytest.raises(ValueError, match=r"leave ,frozen or the auxiliary objective out"):
-            MethodSpec.parse(text)
+    spec = MethodSpec.parse("ssi,auxiliary=acro:k=[1,5],augment=random_shift")
+    assert spec == MethodSpec("ssi", augment="random_shift", auxiliary="acro:k=[1,5]")
+    assert spec.suffix == ",augment=random_shift,auxiliary=acro:k=[1,5]"
+    assert spec.extractor_options == {"augment": "random_shift"}
     with pytest.raises(ValueError, match="unknown method"):
         MethodSpec.parse("abisim,auxiliary=nothing")
+    with pytest.raises(ValueError, match="says auxiliary twice"):
+        MethodSpec.parse("abisim,auxiliary=ssi,auxiliary=abisim")
+
+
+def test_a_frozen_encoder_is_measured_alone() -> None:
+    for text in ("abisim,frozen,auxiliary=ssi", "abisim,auxiliary=ssi:weight=2,frozen"):
+        with pytest.raises(ValueError, match=r"leave one of the two out, or give weight=0"):
+            MethodSpec.parse(text)
+    spec = MethodSpec.parse("ssi=f,frozen,auxiliary=ssi:weight=0")
+    # In the environment there is nothing to measure.
+    assert not spec.embeds_in_env
+    assert spec.policy_kwargs({})["features_extractor_kwargs"] == {"encoder": "f", "freeze": True}
+
+
+def test_behind_a_file_there_is_no_other_option() -> None:
     assert MethodSpec.of_conf_file("mine.yml,auxiliary=ssi") is None
-    assert split_auxiliary(",auxiliary=ssi") == ("", "ssi")
-    assert split_auxiliary("abisim,frozen") == ("abisim,frozen", None)
+    assert MethodSpec.of_conf_file(",auxiliary=ssi") is None
+    assert split_options(",auxiliary=ssi") == ("", {"auxiliary": "ssi"})
+    for config in ("mine.yml,auxiliary=ssi,frozen", "mine.yml,frozen", ",frozen"):
+        with pytest.raises(ValueError, match="is no method, which frozen need"):
+            MethodSpec.of_conf_file(config)
 
 
 def test_callbacks_of_an_entry() -> None:
@@ -98,10 +117,10 @@ def test_it_is_added_to_whatever_the_configuration_is(config: str, tmp_path: Pat
     assert record.label == (None if method is None else f"{method},auxiliary=ssi:weight=0.5")
 
 
-def test_records_of_before_are_read_and_others_are_as_they_were(tmp_path: Path) -> None:
+def test_records_of_before_are_read(tmp_path: Path) -> None:
     record = MethodRecord("abisim", False, "f", "0" * 64, {})
-    record.write(tmp_path)
-    assert "auxiliary" not in json.loads((tmp_path / "method.json").read_text())
+    before = {name: value for name, value in dataclasses.asdict(record).items() if name != "auxiliary"}
+    (tmp_path / "method.json").write_text(json.dumps(before))
     assert MethodRecord.read(tmp_path) == record
     with_one = dataclasses.replace(record, auxiliary="ssi")
     with_one.write(tmp_path)
@@ -145,7 +164,7 @@ def test_train_continue_and_enjoy(
     (["--auxiliary"], "--auxiliary takes a word, such as --auxiliary ssi"),
     (["--auxiliary=ssi", "--auxiliary=curl"], "--auxiliary is given twice, ssi and curl; give one"),
     (["--conf-file", "vanilla,auxiliary=ssi", "--auxiliary", "curl"], "names an auxiliary objective already"),
-    (["-conf", "abisim,frozen", "--auxiliary", "ssi"], "leave ,frozen or the auxiliary objective out"),
+    (["-conf", "abisim,frozen", "--auxiliary", "ssi"], "leave one of the two out, or give weight=0"),
     (["--conf-file", "vanilla", "--auxiliary", "ssi:objective_kwargs.wight=1"], "objective_kwargs do not fit ssi"),
 ])  # fmt: skip
 @pytest.mark.filterwarnings("ignore::ResourceWarning")

@@ -44,7 +44,7 @@ _TRANSPOSITIONS = {
 def _open(path: Path) -> Iterator[Any]:
     """A container. It is given an open file: a name such as ``http:a.mp4`` would be taken for an address."""
     # Titles and the like may be in any encoding.
-    av = _import_decoder("av")
+    av = importlib.import_module("av")
     with path.open("rb") as file, av.open(file, options=dict(_OPTIONS), metadata_errors="ignore") as container:
         yield container
 
@@ -58,7 +58,7 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
         file whose frame rate varies)
     :raises ImportError: if the decoder is not installed
     """
-    av = _import_decoder("av")
+    av = importlib.import_module("av")
     count, end, length = 0, 0.0, None
     try:
         is_whole = require_whole(path)
@@ -107,13 +107,13 @@ def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", floa
     name = _TRANSPOSITIONS[rows]
     if name is None:
         return image, aspect
-    turned = image.transpose(_import_decoder("PIL.Image").Transpose[name])
+    turned = image.transpose(importlib.import_module("PIL.Image").Transpose[name])
     return turned, aspect if rows[0] else 1 / aspect
 
 
 def _video_stream(container: Any, path: Path) -> Any:
     """The video, which is no cover image."""
-    cover = _import_decoder("av.stream").Disposition.attached_pic
+    cover = importlib.import_module("av.stream").Disposition.attached_pic
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
         raise ClipError(f"{path} holds no video{' but a cover' * bool(container.streams.video)}; remove it")
@@ -170,7 +170,7 @@ def expected_frames(source: Source) -> int:
         return len(source.files)
     if source.path.suffix.lower() == ".webp":
         return 0
-    av = _import_decoder("av")
+    av = importlib.import_module("av")
     try:
         with _open(source.path) as container:
             return _promise(container, source.path)[0] or 0
@@ -179,8 +179,8 @@ def expected_frames(source: Source) -> int:
 
 
 def _decode_images(source: Source) -> Iterator["Image.Image"]:
-    image_module = _import_decoder("PIL.Image")
-    ops = _import_decoder("PIL.ImageOps")
+    image_module = importlib.import_module("PIL.Image")
+    ops = importlib.import_module("PIL.ImageOps")
     _check_numbers(source)
     for file in source.files:
         try:
@@ -198,7 +198,7 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
 
 def _decode_webp(path: Path) -> Iterator["Image.Image"]:
     """The images of an animated WebP."""
-    image_module = _import_decoder("PIL.Image")
+    image_module = importlib.import_module("PIL.Image")
     require_whole(path)
     try:
         with image_module.open(path) as image:
@@ -231,7 +231,7 @@ def shrink(image: "Image.Image", aspect: float = 1.0) -> NDArray[np.uint8]:
     :param image: of any size and mode
     :param aspect: width of a pixel over its height
     """
-    box = _import_decoder("PIL.Image").Resampling.BOX
+    box = importlib.import_module("PIL.Image").Resampling.BOX
     # Of the square as it is shown, in units of the height of a pixel.
     side = min(image.width * aspect, image.height)
     left, top = (image.width - side / aspect) / 2, (image.height - side) / 2
@@ -240,13 +240,3 @@ def shrink(image: "Image.Image", aspect: float = 1.0) -> NDArray[np.uint8]:
     region = (left, top, left + side / aspect, top + side)
     small = image.convert("RGB").resize((SIZE, SIZE), box, box=region)
     return np.ascontiguousarray(np.asarray(small).transpose(2, 0, 1))
-
-
-def _import_decoder(module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f"custom videos need PyAV and Pillow ({error}): pip install 'sb3_abisim[video]', "
-            "or leave out videos= to use the built-in backgrounds"
-        ) from error

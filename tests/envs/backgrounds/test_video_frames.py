@@ -152,7 +152,7 @@ class TestDamage:
         with pytest.raises(ClipError, match=r"24 of 25 frames: there is none between frame32\.png and frame36"):
             load_backgrounds(folder)
 
-    @pytest.mark.parametrize("missing", ["av", "PIL.Image"])
+    @pytest.mark.parametrize("missing", ["av", "PIL"])
     def test_decoder_not_installed(self, folder, monkeypatch, missing):
         write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)
         monkeypatch.setitem(sys.modules, missing, None)
