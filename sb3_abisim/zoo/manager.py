@@ -42,18 +42,17 @@ from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
 from sb3_abisim.zoo.auxiliary import auxiliary_of, with_auxiliary
-from sb3_abisim.zoo.methods import (
-    MethodRecord,
-    MethodSpec,
+from sb3_abisim.zoo.entries import (
     encoding_kwargs,
     hyperparameters_entry,
     hyperparameters_file,
     policy_of,
     resolve_classes,
-    split_options,
     unfreezes,
     zoo_hyperparams,
 )
+from sb3_abisim.zoo.method_record import MethodRecord
+from sb3_abisim.zoo.methods import MethodSpec, split_options
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
 from sb3_abisim.zoo.run_files import hash_run
 from sb3_abisim.zoo.spaces import check_replayed, check_spaces

@@ -1,9 +1,7 @@
 """Auxiliary objectives of zoo runs: the word, the callback, the record, and the command."""
 
 import argparse
-import dataclasses
 import importlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,8 @@ from sb3_abisim.benchmark.graph import build, run_labels
 from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.zoo import manager as manager_module
 from sb3_abisim.zoo.auxiliary import auxiliary_of, auxiliary_text, parse_auxiliary, with_auxiliary
-from sb3_abisim.zoo.methods import ENCODER_CALLBACK, MethodRecord, MethodSpec, split_options
+from sb3_abisim.zoo.entries import ENCODER_CALLBACK
+from sb3_abisim.zoo.methods import MethodSpec, split_options
 from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.run_files import read_yaml
 from sb3_abisim.zoo.runs import read_run
@@ -115,19 +114,6 @@ def test_it_is_added_to_whatever_the_configuration_is(config: str, tmp_path: Pat
     assert record.auxiliary == "ssi:weight=0.5"
     method = None if "mine" in config else "vanilla" if "vanilla" in config else "abisim"
     assert record.label == (None if method is None else f"{method},auxiliary=ssi:weight=0.5")
-
-
-def test_records_of_before_are_read(tmp_path: Path) -> None:
-    record = MethodRecord("abisim", False, "f", "0" * 64, {})
-    before = {name: value for name, value in dataclasses.asdict(record).items() if name != "auxiliary"}
-    (tmp_path / "method.json").write_text(json.dumps(before))
-    assert MethodRecord.read(tmp_path) == record
-    with_one = dataclasses.replace(record, auxiliary="ssi")
-    with_one.write(tmp_path)
-    assert MethodRecord.read(tmp_path) == with_one
-    (tmp_path / "method.json").write_text(json.dumps({**dataclasses.asdict(record), "auxiliary": 1}))
-    with pytest.raises(ValueError, match="damaged"):
-        MethodRecord.read(tmp_path)
 
 
 def test_train_continue_and_enjoy(
