@@ -25,6 +25,7 @@ import yaml
 
 from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.benchmark.report.groups import Group, group_runs, labeled_runs
+from sb3_abisim.benchmark.report.tables import time_to
 
 ROOT = Path(__file__).resolve().parent.parent
 RUNS = ROOT / "benchmarks" / "results" / "comparison"
@@ -57,13 +58,6 @@ def _final(cell: Cell, measure: str) -> list[float]:
     return found
 
 
-def _steps_of(group: Group, argument: str) -> tuple[np.ndarray[Any, np.dtype[np.float64]], int]:
-    """Steps of each run to a normalized return, NaN where it is not reached, and the horizon."""
-    level = group.low + float(argument) * (group.high - group.low)
-    horizon = int(min(curve.steps[-1] for curve in group.curves))
-    return np.array([statistics.steps_to_threshold(c.steps, c.returns, level, horizon) for c in group.curves]), horizon
-
-
 def _digits(group: Group) -> int:
     """Behind the point of a return."""
     return 1 if group.high - group.low > 10 else 2
@@ -90,7 +84,7 @@ def _area(cell: Cell) -> str:
 
 
 def _steps(cell: Cell) -> str:
-    steps, horizon = _steps_of(cell.group, cell.argument)
+    steps, horizon = cell.group.steps_to(cell.group.level(float(cell.argument))), cell.group.horizon
     n_reached = int((~np.isnan(steps)).sum())
     if not n_reached:
         return f"not within {horizon:,}"
@@ -101,13 +95,22 @@ def _steps(cell: Cell) -> str:
 def _ratio(cell: Cell) -> str:
     if cell.group.label == cell.first.label:
         return "1"
-    (first, first_horizon), (steps, horizon) = (_steps_of(group, cell.argument) for group in (cell.first, cell.group))
-    ratio = statistics.steps_ratio(first, steps, (first_horizon, horizon))
+    pair = cell.first, cell.group
+    first, steps = (group.steps_to(group.level(float(cell.argument))) for group in pair)
+    ratio = statistics.steps_ratio(first, steps, (pair[0].horizon, pair[1].horizon))
     if np.isnan(ratio.value):
         return "neither reaches it"
     prefix = {"": "", "<=": "at most ", ">=": "at least ", "~": "about "}[ratio.bound]
     interval = "" if np.isnan(ratio.low) else f" [{ratio.low:.2f}, {ratio.high:.2f}]"
     return f"{prefix}{ratio.value:.2f}{interval}"
+
+
+def _minutes(cell: Cell) -> str:
+    found = time_to(cell.group, cell.group.level(float(cell.argument)), "processor_seconds")
+    if found is None:
+        return "unknown"
+    bound, half = ("over " if found["bound"] else ""), (found["high"] - found["low"]) / 2
+    return f"{bound}{found['minutes']:.1f}" + (f" ± {half:.1f}" if np.isfinite(half) else "")
 
 
 def _runs(cell: Cell) -> str:
@@ -130,6 +133,7 @@ COLUMNS: dict[str, tuple[Callable[[Cell], str], Callable[[str], str]]] = {
     "area": (_area, lambda argument: "mean return of the run"),
     "steps": (_steps, lambda argument: f"steps to {_percent(argument)}"),
     "ratio": (_ratio, lambda argument: f"ratio of steps to {_percent(argument)}"),
+    "minutes": (_minutes, lambda argument: f"minutes of processor time to {_percent(argument)}"),
     "runs": (_runs, lambda argument: "runs"),
 }
 

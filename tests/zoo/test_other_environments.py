@@ -145,6 +145,7 @@ def test_train_enjoy_and_evaluate(
         "preprocessing": {},
         "task_features_dim": 0,
         "augment": None,
+        "auxiliary": None,
     }
     assert read_run(folder).label == "ssi" + ",frozen" * (kind == "frozen")
     assert len(np.load(folder / "evaluations.npz")["timesteps"]) == 2
