@@ -92,7 +92,7 @@ class EncoderCallback(BaseCallback):
             print(f"Content hash of the training environment: {content_hash}")
 
     def check(self, model: BaseAlgorithm) -> None:
-        """Refuse a model that the arguments are not for; training starts with it, and commands ask before.
+        """Refuse a model that the arguments are not for; training starts with it.
 
         :param model: with its environment
         :raises ValueError: with the reason

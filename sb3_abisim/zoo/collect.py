@@ -17,7 +17,7 @@ from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.merge import merge_encoder
 from sb3_abisim.rl.vec_encode import EncodedBox
-from sb3_abisim.zoo.methods import hyperparameters_entry, read_entries
+from sb3_abisim.zoo.entries import hyperparameters_entry, read_entries
 from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, normalizes_observations, other_vec_wrappers
 from sb3_abisim.zoo.runs import read_run

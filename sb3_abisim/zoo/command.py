@@ -10,9 +10,10 @@ import gymnasium as gym
 
 from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs
 from sb3_abisim.registry import is_import_path
+from sb3_abisim.zoo.auxiliary import GRAMMAR, parse_auxiliary
 from sb3_abisim.zoo.guard import GUARDED, guarded
 from sb3_abisim.zoo.manager import MethodExperimentManager
-from sb3_abisim.zoo.methods import grammar
+from sb3_abisim.zoo.methods import grammar, split_options
 
 # The commands of rl-zoo3 by name: the module, and an example.
 SCRIPTS = {
@@ -29,6 +30,8 @@ _WITH_PACKAGES = ("train", "enjoy")
 _UNPICKLES = "plot_from_file"
 _TRUST = "--trust"
 _PACKAGES = ("--packages", "--gym-packages")
+_CONF_FILE = ("-conf", "--conf-file")
+_AUXILIARY = "--auxiliary"
 _PAIRS = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 
 
@@ -53,6 +56,7 @@ def main(argv: Sequence[str]) -> None:
     if {"-h", "--help"} & set(flags):
         if command == "train":
             print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
+            print(f"{_AUXILIARY} {GRAMMAR} trains the encoder by an objective, too: --auxiliary abisim:weight=0.5.")
         print("--packages MODULE ... imports modules that register environments, methods, networks or readers.")
         if command in (*GUARDED, _UNPICKLES):
             print(f"{_TRUST} opens the pickles of a run folder, which execute whatever they hold: for your own alone.")
@@ -66,6 +70,8 @@ def main(argv: Sequence[str]) -> None:
             )
         words, packages = for_rl_zoo3([flag for flag in flags if flag != _TRUST])
         import_packages(packages)
+        if command == "train":
+            words = _with_auxiliary(words)
         modules = [name for name in packages if not is_import_path(name)]
         if modules and command in _WITH_PACKAGES:
             words += ["--gym-packages", *modules]
@@ -115,6 +121,36 @@ def for_rl_zoo3(flags: Sequence[str]) -> tuple[list[str], list[str]]:
         else:
             words.append(value)
     return words, packages
+
+
+def _with_auxiliary(words: Sequence[str]) -> list[str]:
+    """``--auxiliary X`` as ``--conf-file ...,auxiliary=X``, which the run's folder then records.
+
+    :param words: flags in rl-zoo3's form
+    :raises ValueError: for one without its word, or two of them
+    """
+    rest: list[str] = []
+    found: dict[str, list[str]] = {_AUXILIARY: [], "--conf-file": []}
+    words = list(words)
+    while words:
+        word = words.pop(0)
+        option, equals, value = word.partition("=")
+        if option != _AUXILIARY and option not in _CONF_FILE:
+            rest.append(word)
+            continue
+        if not equals and not words:
+            raise ValueError(f"{option} takes a word, such as {_AUXILIARY} ssi")
+        found[_AUXILIARY if option == _AUXILIARY else "--conf-file"].append(value if equals else words.pop(0))
+    if len(found[_AUXILIARY]) > 1:
+        raise ValueError(f"{_AUXILIARY} is given twice, {' and '.join(found[_AUXILIARY])}; give one")
+    configs = found["--conf-file"][-1:]
+    for auxiliary in found[_AUXILIARY]:
+        config = configs[0] if configs else ""
+        if "auxiliary" in split_options(config)[1]:
+            raise ValueError(f"--conf-file {config} names an auxiliary objective already; leave {_AUXILIARY} out")
+        parse_auxiliary(auxiliary)
+        configs = [f"{config},auxiliary={auxiliary}"]
+    return rest + [word for config in configs for word in ("--conf-file", config)]
 
 
 def _pair(name: str, value: object, option: str) -> str:

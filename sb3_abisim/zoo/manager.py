@@ -10,6 +10,7 @@ For every environment:
 
 * ``--conf-file METHOD[=ENCODER][,frozen][,option=value]`` keeps the hyperparameters and replaces the features
   extractor; frozen and without options, it puts ``VecEncodeObservations`` in its place;
+* ``,auxiliary=OBJECTIVE`` behind any of these, a file or nothing adds an ``AuxiliaryObjective`` to the callbacks;
 * ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
 * a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
@@ -29,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -37,12 +39,10 @@ from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
-from sb3_abisim.rl.callbacks import EncoderCallback
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
-from sb3_abisim.zoo.methods import (
-    MethodRecord,
-    MethodSpec,
+from sb3_abisim.zoo.auxiliary import auxiliary_of, with_auxiliary
+from sb3_abisim.zoo.entries import (
     encoding_kwargs,
     hyperparameters_entry,
     hyperparameters_file,
@@ -51,6 +51,8 @@ from sb3_abisim.zoo.methods import (
     unfreezes,
     zoo_hyperparams,
 )
+from sb3_abisim.zoo.method_record import MethodRecord
+from sb3_abisim.zoo.methods import MethodSpec, split_options
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
 from sb3_abisim.zoo.run_files import hash_run
 from sb3_abisim.zoo.spaces import check_replayed, check_spaces
@@ -68,7 +70,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     """``rl_zoo3.exp_manager.ExperimentManager`` that knows methods; parameters as there."""
 
     algo: str
-    callbacks: list[Any]
+    callbacks: list[BaseCallback]
     config: str
     custom_hyperparams: dict[str, Any] | None
     env_kwargs: dict[str, Any]
@@ -90,8 +92,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         :raises ValueError: for an unknown method, or hyperparameters that do not fit together
         """
         env_id = self.env_name.gym_id
-        is_default = Path(self.config).parent == zoo_hyperparams()
-        self._spec = None if is_default else MethodSpec.of_conf_file(self.config)
+        self._spec = MethodSpec.of_conf_file(self.config)
+        self.config, options = split_options(self.config)
+        is_default = not self.config or Path(self.config).parent == zoo_hyperparams()
         if self.trial_id is not None and (self._spec is not None or env_id in ENV_IDS):
             raise ValueError(
                 "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
@@ -107,6 +110,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 replaced["policy"] = policy_of(self.algo, replaced["policy"])
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
+        if "auxiliary" in options:
+            for each in (hyperparams, saved_hyperparams):
+                each["callback"] = with_auxiliary(each.get("callback"), options["auxiliary"])
         self._check_normalize(hyperparams)
         self._set_batched_vec_env(hyperparams)
         self._set_eval_env_kwargs(hyperparams)
@@ -209,6 +215,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 self.params_path = f"{self.save_path}/{self.env_name}"
 
     def _make_record(self) -> MethodRecord:
+        return dataclasses.replace(self._record_encoder(), auxiliary=auxiliary_of(self._used))
+
+    def _record_encoder(self) -> MethodRecord:
         preprocessing = {key: self._used[key] for key in PREPROCESSING_KEYS if key in self._used}
         encoding = encoding_kwargs(self._used)
         if encoding is not None:
@@ -239,15 +248,12 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         )
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """As rl-zoo3 does, once the encoder's callback agrees.
+        """As rl-zoo3 does.
 
         :param model: to train
-        :raises ValueError: for a model that its arguments are not for
         """
-        for callback in self.callbacks:
-            if isinstance(callback, EncoderCallback):
-                callback.check(model)
-        MethodExperimentManager.has_begun = True
+        # Behind all others, which look first whether they can do what they are asked to.
+        self.callbacks.append(_HasBegun())
         super().learn(model)
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
@@ -287,6 +293,16 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             self._hyperparams = _KeepExtractor(self._hyperparams)
         MethodExperimentManager.has_begun = True
         super().hyperparameters_optimization()
+
+
+class _HasBegun(BaseCallback):
+    """Notes that training has begun: errors from then on are no mistakes of the command."""
+
+    def _on_training_start(self) -> None:
+        MethodExperimentManager.has_begun = True
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class _KeepExtractor(dict[str, Any]):
