@@ -28,6 +28,8 @@ _WITH_PACKAGES = ("train", "enjoy")
 # Reads a pickle that only it and its like write.
 _UNPICKLES = "plot_from_file"
 _TRUST = "--trust"
+# Before training has begun, they are mistakes of the command.
+_MISTAKES = (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error)
 _PACKAGES = ("--packages", "--gym-packages")
 _PAIRS = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 
@@ -54,11 +56,12 @@ def main(argv: Sequence[str]) -> None:
         if command == "train":
             print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
         print("--packages MODULE ... imports modules that register environments, methods, networks or readers.")
-        if command in (*GUARDED, _UNPICKLES):
+        if command in (*GUARDED, _UNPICKLES, "train"):
             print(f"{_TRUST} opens the pickles of a run folder, which execute whatever they hold: for your own alone.")
         print(f"example: {prog} {example}\n")
     MethodExperimentManager.has_begun = False
     is_trusted = _TRUST in flags
+    MethodExperimentManager.builds_from_yaml = not is_trusted
     try:
         if command == _UNPICKLES and not is_trusted and not {"-h", "--help"} & set(flags):
             raise ValueError(
@@ -75,16 +78,31 @@ def main(argv: Sequence[str]) -> None:
         with guarded() if command in GUARDED and not is_trusted else contextlib.nullcontext():
             runpy.run_module(module, run_name="__main__")
     except FloatingPointError as error:
-        # Training has stopped, and no model was saved.
+        # Training has stopped, and no final model was saved.
         print(f"{prog}: {one_line(error)}", file=sys.stderr)
         sys.exit(1)
-    except (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error) as error:
+    except Exception as error:
+        if MethodExperimentManager.has_begun and (system := _system_error(error)) is not None:
+            print(f"{prog}: {one_line(system)}; training has stopped", file=sys.stderr)
+            sys.exit(1)
+        if not isinstance(error, _MISTAKES):
+            raise
         # Of TypeErrors, an unknown hyperparameter or argument of an environment is a mistake of the command.
         is_mistake = not isinstance(error, TypeError) or "unexpected keyword argument" in str(error)
         if MethodExperimentManager.has_begun or not is_mistake:
             raise
         print(f"{prog}: error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
+    finally:
+        MethodExperimentManager.builds_from_yaml = False
+
+
+def _system_error(error: BaseException) -> OSError | None:
+    """What the system said, such as that a disk is full: it may lie beneath what a library made of it."""
+    below: BaseException | None = error
+    while below is not None and not isinstance(below, OSError):
+        below = below.__cause__ or below.__context__
+    return below
 
 
 def for_rl_zoo3(flags: Sequence[str]) -> tuple[list[str], list[str]]:

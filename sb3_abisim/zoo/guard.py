@@ -15,11 +15,10 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from sb3_abisim.zoo.models import load_model
+from sb3_abisim.zoo.models import load_model, read_model_run
 from sb3_abisim.zoo.named import read_text
 from sb3_abisim.zoo.preprocessing import items, wrapper_classes
 from sb3_abisim.zoo.run_files import RunLoader, read_yaml
-from sb3_abisim.zoo.runs import read_run
 from sb3_abisim.zoo.saved_spaces import read_vec_normalize
 
 GUARDED = ("enjoy", "record_video")
@@ -47,11 +46,7 @@ class _Models:
 
         :param path: the zip
         """
-        try:
-            run = read_run(Path(path).parent)
-        except ValueError as error:
-            raise ValueError(f"{error}; if you made {path} or trust whoever did, --trust unpickles it") from error
-        return load_model(Path(path), run)
+        return load_model(Path(path), read_model_run(Path(path)))
 
 
 class _Normalizers:
