@@ -51,7 +51,7 @@ from sb3_abisim.zoo.methods import (
 )
 from sb3_abisim.zoo.models import continued_model, read_model_run
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
-from sb3_abisim.zoo.run_files import hash_run
+from sb3_abisim.zoo.run_files import MEANS_NAME, hash_run
 from sb3_abisim.zoo.saved_spaces import read_vec_normalize
 from sb3_abisim.zoo.spaces import check_replayed, check_spaces
 
@@ -297,7 +297,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
 
     def _maybe_normalize(self, env: Any, eval_env: bool) -> Any:
         """As rl-zoo3 does; saved means are read by an unpickler that makes nothing else."""
-        path = Path(self.trained_agent).parent / self.env_name / "vecnormalize.pkl"
+        path = Path(self.trained_agent).parent / self.env_name / MEANS_NAME
         if not (self.builds_from_yaml and path.is_file()):
             return super()._maybe_normalize(env, eval_env)
         try:
