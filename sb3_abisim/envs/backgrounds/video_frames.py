@@ -53,8 +53,14 @@ _TRANSPOSITIONS = {
 
 
 @contextlib.contextmanager
-def _open(path: Path) -> Iterator[Any]:
-    """A container. It is given an open file: a name such as ``http:a.mp4`` would be taken for an address."""
+def open_container(path: Path) -> Iterator[Any]:
+    """A video file as a container of PyAV, which reads this file and nothing else.
+
+    It is given an open file: a name such as ``http:a.mp4`` would be taken for an address.
+
+    :param path: the file
+    :raises av.FFmpegError: if it is none of the formats that are read
+    """
     # Titles and the like may be in any encoding.
     av = _import_decoder("av")
     with path.open("rb") as file, av.open(file, options=dict(_OPTIONS), metadata_errors="ignore") as container:
@@ -75,7 +81,7 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
     most = _MAX_PIXELS + _MAX_PIXELS_PER_BYTE * path.stat().st_size
     try:
         is_whole = require_whole(path)
-        with _open(path) as container:
+        with open_container(path) as container:
             stream = _video_stream(container, path)
             promised, share = _promise(container, path)
             if promised is None and not is_whole:
@@ -200,7 +206,7 @@ def expected_frames(source: Source) -> int:
         return 0
     av = _import_decoder("av")
     try:
-        with _open(source.path) as container:
+        with open_container(source.path) as container:
             return _promise(container, source.path)[0] or 0
     except (ClipError, av.FFmpegError):
         return 0  # decoding will report what is wrong
