@@ -15,8 +15,9 @@ from sb3_abisim.envs.scan_nav.upright import LEVEL_BIN, UP_AXES, level_areas
 MAX_PIXELS = 20_000_000
 _PIXELS_AT_A_TIME = 2_000_000
 MIN_METERS_PER_PIXEL, MAX_METERS_PER_PIXEL = 0.0005, 1.0
-# Pixels that the faces may cover in all, each face for itself: as many layers of the map, and these in any case.
-MAX_LAYERS, FREE_FRAGMENTS, MAX_FRAGMENTS = 200, 100_000_000, 3_000_000_000
+# Pixels that the faces may cover in all, each face for itself: so many for each face, and these in any case, which take
+# half a minute. Large scans have many faces; a few that cover a map again and again are there to take time.
+FRAGMENTS_PER_FACE, FREE_FRAGMENTS, MAX_FRAGMENTS = 500, 100_000_000, 3_000_000_000
 # A level is a floor if it has this share of the largest level's area, and floors are this far apart.
 FLOOR_SHARE = 0.25
 FLOOR_DISTANCE = 1.5  # m
@@ -175,7 +176,7 @@ def _check_layers(source: str, grid: NDArray[np.float64], n_pixels: int) -> None
     """Refuse what would take hours: faces that lie on top of one another hundreds of times."""
     size = np.ptp(grid, axis=1)
     covered = float((abs(_turn(grid)) / 2).sum() + 2 * len(range(15)) * size[:, :2].max(axis=1).sum())
-    granted = min(MAX_FRAGMENTS, max(MAX_LAYERS * n_pixels, FREE_FRAGMENTS))
+    granted = min(MAX_FRAGMENTS, max(FRAGMENTS_PER_FACE * len(grid), FREE_FRAGMENTS))
     if covered > granted:
         raise SceneError(
             f"{source}: its faces cover {covered:.3g} pixels in all, more than {granted:.3g}, of a map of {n_pixels}; "
