@@ -16,8 +16,8 @@ MAX_PIXELS = 20_000_000
 _PIXELS_AT_A_TIME = 2_000_000
 MIN_METERS_PER_PIXEL, MAX_METERS_PER_PIXEL = 0.0005, 1.0
 # Pixels that the faces may cover in all, each face for itself: so many for each face, and these in any case, which take
-# half a minute. Large scans have many faces; a few that cover a map again and again are there to take time.
-FRAGMENTS_PER_FACE, FREE_FRAGMENTS, MAX_FRAGMENTS = 500, 100_000_000, 3_000_000_000
+# a quarter of a minute. Large scans have many faces; a few that cover a map again and again are there to take time.
+FRAGMENTS_PER_FACE, FREE_FRAGMENTS, MAX_FRAGMENTS = 500, 200_000_000, 3_000_000_000
 # A level is a floor if it has this share of the largest level's area, and floors are this far apart.
 FLOOR_SHARE = 0.25
 FLOOR_DISTANCE = 1.5  # m

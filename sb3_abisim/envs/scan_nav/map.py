@@ -193,7 +193,7 @@ class ScanMap:
 _KEYS = ("format", "orthophoto", "height", "walkable", "meters_per_pixel", "origin", "source", "settings")
 # Beside what read_npz says: of parts that are there and are something else.
 _UNREADABLE = (
-    OSError, KeyError, ValueError, IndexError, TypeError, AttributeError, RecursionError, OverflowError,
+    OSError, KeyError, ValueError, IndexError, TypeError, AttributeError, RuntimeError, OverflowError,
     zipfile.BadZipFile,
 )  # fmt: skip
 
