@@ -35,6 +35,12 @@ from benchmarks.reliability.layout import (
 )
 
 
+def _floors(side: int, n: int) -> str:
+    corners = [(0, 0), (0, side), (side, side), (side, 0)]
+    lines = [f"v {x} {0.001 * k:.3f} {z}" for k in range(n) for x, z in corners]
+    return "\n".join([*lines, *(f"f {4 * k + 1} {4 * k + 2} {4 * k + 3} {4 * k + 4}" for k in range(n)), ""])
+
+
 class Corpus(Layout):
     """The cases, each with a name.
 
@@ -266,7 +272,9 @@ class Corpus(Layout):
             "obj, spaces": self._scan("s.obj", "v 0 0 0" + " " * 20_000_000 + "\n"),
             "obj, backslashes": self._scan("s.obj", "\\\n" * 3_000_000),
             "mtl, options": self._scan("s.obj", "mtllib m.mtl\nv 0 0 0\n", {"m.mtl": options}),
-            "a room as large as a map may be": self._room(89.4),
+            "a room as large as a map may be": self._room(79.9),
+            "a hundred floors upon each other": self._scan("s.obj", _floors(89, 100)),
+            "as many floors as are read": self._scan("s.obj", _floors(79, 12)),
             "large in meters": self._scan("s.obj", "v 0 0 0\nv 9e9 0 0\nv 9e9 0 9e9\nv 0 0 9e9\nf 1 4 3 2\n"),
         }  # fmt: skip
         for text in (f"element vertex {HUGE}", "element vertex -5", "element vertex 99999999999999999999999"):

@@ -175,21 +175,21 @@ def artifacts(scale: float) -> list[Artifact]:
         return max(len(DAMAGES), int(scale * times))
 
     return [
-        Artifact("dataset: shards", "data", ("*.npy",), _dataset, n(2000)),
-        Artifact("dataset: meta.json", "data", ("meta.json",), _dataset, n(2000)),
-        Artifact("dataset, collected again", "data", ("*.npy", "*.json"), _collect_again, n(400)),
-        Artifact("encoder file", "encoder.safetensors", (), _encoder, n(2000)),
-        Artifact("checkpoint", "", ("*.safetensors",), _checkpoint, n(2000), _write_checkpoint),
+        Artifact("dataset: shards", "data", ("*.npy",), _dataset, n(8000)),
+        Artifact("dataset: meta.json", "data", ("meta.json",), _dataset, n(8000)),
+        Artifact("dataset, collected again", "data", ("*.npy", "*.json"), _collect_again, n(1000)),
+        Artifact("encoder file", "encoder.safetensors", (), _encoder, n(8000)),
+        Artifact("checkpoint", "", ("*.safetensors",), _checkpoint, n(8000), _write_checkpoint),
         *(
-            Artifact(f"run: {pattern.rpartition('/')[2]}", "bench", (pattern,), _results, n(600))
+            Artifact(f"run: {pattern.rpartition('/')[2]}", "bench", (pattern,), _results, n(2000))
             for pattern in RUN_PATTERNS
         ),
-        Artifact("benchmark.json", "bench", ("benchmark.json",), _results, n(600)),
-        Artifact("export: all files", "export", ("**/*",), _results, n(2000)),
-        Artifact("saved model", run_folder(Path()).as_posix(), ("*.zip",), _model, n(600)),
-        Artifact("clip cache", "clips", ("../cache/**/*",), _clips, n(600)),
-        Artifact("scan map", "map.npz", (), _map, n(1000)),
-        Artifact("scan cache", "room.ply", ("../cache/**/*.npz",), _scan, n(300)),
+        Artifact("benchmark.json", "bench", ("benchmark.json",), _results, n(2000)),
+        Artifact("export: all files", "export", ("**/*",), _results, n(8000)),
+        Artifact("saved model", run_folder(Path()).as_posix(), ("*.zip",), _model, n(2000)),
+        Artifact("clip cache", "clips", ("../cache/**/*",), _clips, n(2000)),
+        Artifact("scan map", "map.npz", (), _map, n(4000)),
+        Artifact("scan cache", "room.ply", ("../cache/**/*.npz",), _scan, n(1000)),
     ]  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reliability.children import command
-from benchmarks.reliability.forge import MARKER, pickled
+from benchmarks.reliability.forge import MARKER, archive, pickled
 from benchmarks.reliability.inputs import ALGO, ENV_ID, copy_of, run_folder, write_room
 
 CHECKPOINT = "c/checkpoint-000000004.safetensors"
@@ -133,8 +133,8 @@ class Layout:
     def _pickle_in_zip(where: str) -> Callable[[Path], Any]:
         def change(place: Path) -> None:
             path = place / f"{ENV_ID}.zip"
-            with zipfile.ZipFile(path) as archive:
-                members = {name: archive.read(name) for name in archive.namelist()}
+            with zipfile.ZipFile(path) as whole:
+                members = {name: whole.read(name) for name in whole.namelist()}
             data = pickled(place.parents[2])
             if where.endswith(".pth"):
                 members[where] = data
@@ -304,7 +304,7 @@ def link(path: Path, target: Path) -> None:
 def forge(folder: Path) -> None:
     """Make all hashes of a dataset right, as far as its meta.json can be read."""
     from sb3_abisim.common.files import file_hash
-    from sb3_abisim.data.format import make_meta
+    from sb3_abisim.data.format import DOCUMENT_HASH_KEY, HASH_KEY, make_meta
 
     path = folder / "meta.json"
     try:
@@ -312,7 +312,7 @@ def forge(folder: Path) -> None:
         for shard in meta["shards"]:
             for name, entry in shard["files"].items():
                 entry |= {"bytes": (folder / name).stat().st_size, "sha256": file_hash(folder / name)}
-        computed = ("n_transitions", "n_frames", "shards", "digest", "checksum")
+        computed = ("n_transitions", "n_frames", "shards", HASH_KEY, DOCUMENT_HASH_KEY)
         config = {key: value for key, value in meta.items() if key not in computed}
         path.write_text(json.dumps(make_meta(config, meta["shards"])))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):

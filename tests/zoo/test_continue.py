@@ -65,6 +65,7 @@ def test_it_goes_on_to_the_bit(name: str, tmp_path: Path, monkeypatch: pytest.Mo
         ("moved", "lies in no folder of a run, whose YAML would say how to build it"),
         ("algorithm", "is a model of dqn, not qrdqn; give --algo dqn"),
         ("environment", "was trained in another environment"),
+        ("memory", "it was trained with optimize_memory_usage, which is not given now"),
     ],
 )
 def test_what_is_refused(
@@ -83,6 +84,10 @@ def test_what_is_refused(
         (made.folder / env_id / "vecnormalize.pkl").write_bytes(poison)
     elif harm == "moved":
         model = Path(shutil.copy(model, tmp_path / "alone.zip"))
+    elif harm == "memory":
+        config = made.folder / env_id / "config.yml"
+        config.write_text(config.read_text().rstrip() + "\n  - - optimize_memory_usage\n    - true\n")
+        (made.folder / "hashes.json").unlink()
     elif harm == "algorithm":
         flags["algo"] = "qrdqn"
     else:

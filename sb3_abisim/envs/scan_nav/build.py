@@ -12,7 +12,7 @@ from sb3_abisim.envs.scan_nav.raster import Nearest, shade, solid_contour_pixels
 from sb3_abisim.envs.scan_nav.surfaces import Surface
 from sb3_abisim.envs.scan_nav.upright import LEVEL_BIN, UP_AXES, level_areas
 
-MAX_PIXELS = 20_000_000
+MAX_PIXELS = 16_000_000
 _PIXELS_AT_A_TIME = 2_000_000
 MIN_METERS_PER_PIXEL, MAX_METERS_PER_PIXEL = 0.0005, 1.0
 # Pixels that the faces may cover in all, each face for itself: so many for each face, and these in any case, which take

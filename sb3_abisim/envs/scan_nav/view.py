@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.map import ScanMap
 
-MAX_VIEW_PIXELS = 20_000_000  # of a whole scene
+MAX_VIEW_PIXELS = 16_000_000  # of a whole scene
 # Columns that are averaged together, and what is no part of another pixel.
 _BLOCK, _ROUNDING = 256, 1e-9
 CAMERA_HEIGHT = 3.0  # m above the floor
