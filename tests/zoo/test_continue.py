@@ -5,6 +5,7 @@ import pickle
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from model_inputs import CASES, Execute, flat, rewrite, train
@@ -54,6 +55,22 @@ def test_it_goes_on_to_the_bit(name: str, tmp_path: Path, monkeypatch: pytest.Mo
         first, second = (pickle.loads(path.read_bytes()) for path in means)
         assert isinstance(first, VecNormalize)
         assert (first.ret_rms.mean, first.ret_rms.var) == (second.ret_rms.mean, second.ret_rms.var)
+
+
+def test_means_stay_as_they_are_in_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    algo, env_id, method, words = NAMES["ppo-normalized"]
+    made = train(monkeypatch, tmp_path / "before", algo, env_id, method, *words)
+    shown: list[tuple[bool, bool, bool]] = []
+    real = MethodExperimentManager._maybe_normalize
+
+    def watched(manager: Any, env: Any, eval_env: bool) -> Any:
+        normalized = real(manager, env, eval_env)
+        shown.append((eval_env, normalized.training, normalized.norm_reward))
+        return normalized
+
+    monkeypatch.setattr(MethodExperimentManager, "_maybe_normalize", watched)
+    go_on(monkeypatch, made, "ppo-normalized", tmp_path / "after", "--eval-freq", "150", "--eval-episodes", "1")
+    assert set(shown) == {(True, False, False), (False, True, True)}
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from zoo_inputs import run
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.zoo.evaluate import SEED, evaluate_final
 from sb3_abisim.zoo.record import record
+from sb3_abisim.zoo.run_envs import final_model, make_run_env
 from sb3_abisim.zoo.runs import read_run
 
 ENV_ID = "Nav2D-v0"
@@ -40,7 +41,11 @@ def unpickled(folder: Path, n_envs: int) -> tuple[PPO, VecNormalize]:
 def test_evaluation_is_that_of_the_unpickled_run(folder: Path) -> None:
     model, env = unpickled(folder, 4)
     evaluate_final(folder, 4)
-    found = read_run(folder).final()
+    made = read_run(folder)
+    shown = make_run_env(made, final_model(made), 1, {}, 0)
+    assert isinstance(shown, VecNormalize) and not (shown.training or shown.norm_reward)
+    shown.close()
+    found = made.final()
     assert found is not None
     for mode in ("deterministic", "stochastic"):
         set_random_seed(SEED)
