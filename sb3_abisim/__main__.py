@@ -22,6 +22,7 @@ COMMANDS = {
     "analyze": ("sb3_abisim.analysis.command", "show what an encoder sees: figures and numbers"),
     "benchmark": ("sb3_abisim.benchmark.command", "compare methods over environments and seeds, and report"),
     "zoo": ("sb3_abisim.zoo.command", "any other command of rl-zoo3, such as record_video or all_plots"),
+    "doctor": ("sb3_abisim.doctor", "say what is installed, or what is inside a file and whether it loads here"),
     "demo": ("sb3_abisim.demo", "the whole way in ten minutes: collect, pretrain, train, record"),
 }
 

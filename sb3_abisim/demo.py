@@ -5,7 +5,6 @@ trained agent and the folder where everything lies. The budget is far below the 
 """
 
 import argparse
-import importlib.util
 import shlex
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_abisim.common.cli import PROGRAM, make_parser, run
+from sb3_abisim.common.extras import require_extra
 from sb3_abisim.zoo.record import record
 
 ENV_ID = "DistractorPointMaze-v0"
@@ -92,9 +92,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _command(args: argparse.Namespace) -> None:
     # Now, not after ten minutes.
-    missing = [name for name in ("matplotlib", "PIL") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ValueError(f"{' and '.join(missing)} not installed; run: pip install 'sb3_abisim[plots]'")
+    require_extra("plots", "the demo", "matplotlib", "PIL")
     folder, start = Path(args.output), time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     for words in commands(folder, args.n_transitions, args.n_updates, args.n_timesteps):

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.extras import needs_extra
+
 Floats = NDArray[np.floating[Any]]
 
 
@@ -97,10 +99,8 @@ def _expected_next(distance: Floats, nexts: NDArray[Any], other_nexts: NDArray[A
 
 def _expected_transport(distance: Floats, probs: NDArray[Any], other_probs: NDArray[Any], weights: Floats) -> Floats:
     """E_a[W_1] by exact optimal transport, (n, m)."""
-    try:
+    with needs_extra("analysis", "the exact metric of stochastic transitions"):
         ot = importlib.import_module("ot")
-    except ImportError as error:
-        raise ImportError("stochastic transitions need POT: pip install 'sb3_abisim[analysis]'") from error
     cost = distance.astype(np.float64)
     expected = np.zeros_like(distance)
     per_pair = np.broadcast_to(weights, (*distance.shape, probs.shape[1]))

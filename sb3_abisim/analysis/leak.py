@@ -19,6 +19,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.scenes import sample_episodes
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.objectives.actions import actions_of
 from sb3_abisim.zoo.collect import preprocessing_entry
@@ -123,7 +124,8 @@ def _score(pixels: NDArray[np.uint8], components: NDArray[Any]) -> float:
 
 
 def _score_component(pixels: NDArray[np.uint8], values: NDArray[Any]) -> float:
-    from sklearn.tree import DecisionTreeClassifier, DecisionTreeRegressor
+    with needs_extra("analysis", "the audit of leaks"):
+        from sklearn.tree import DecisionTreeClassifier, DecisionTreeRegressor
 
     split = 2 * len(pixels) // 3
     is_choice = values.dtype.kind in "iu"

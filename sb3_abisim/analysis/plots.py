@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.extras import needs_extra
+
 DPI = 90
 CMAP = "inferno"
 COLORS = {"agent": (214, 40, 40), "obstacles": (60, 64, 72), "floor": (240, 240, 235), "goal": (46, 160, 67)}
@@ -15,12 +17,10 @@ COLORS = {"agent": (214, 40, 40), "obstacles": (60, 64, 72), "floor": (240, 240,
 def pyplot() -> Any:
     """Matplotlib's pyplot, without a window.
 
-    :raises ValueError: if matplotlib is not installed
+    :raises ImportError: if matplotlib is not installed
     """
-    try:
+    with needs_extra("plots", "a figure"):
         import matplotlib
-    except ImportError as error:
-        raise ValueError("matplotlib is not installed; run: pip install 'sb3_abisim[plots]'") from error
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 

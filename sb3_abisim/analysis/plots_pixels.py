@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.registry import get_traits
 
 N_COLORS = 256
@@ -107,7 +108,8 @@ def _visible(observation: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _reduce_colors(path: Path) -> None:
     """Photographs and many panels make large PNGs; with a palette they take a third of that."""
-    from PIL import Image
+    with needs_extra("plots", "a figure"):
+        from PIL import Image
 
     with Image.open(path) as image:
         small = image.convert("RGB").quantize(N_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)

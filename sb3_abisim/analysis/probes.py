@@ -30,6 +30,7 @@ from sb3_abisim.analysis.scenes import (
     sample_episodes,
 )
 from sb3_abisim.benchmark.report.statistics import mean_and_interval
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile
 
@@ -56,7 +57,8 @@ class Target:
 
         :param predictions: as ``values``
         """
-        from sklearn.metrics import r2_score, roc_auc_score
+        with needs_extra("analysis", "a probe"):
+            from sklearn.metrics import r2_score, roc_auc_score
 
         varies = self.values.std(axis=0) > 0
         if not varies.any():
@@ -109,10 +111,11 @@ def make_probe(kind: str) -> Any:
 
     :param kind: one of :data:`PROBES`
     """
-    from sklearn.linear_model import RidgeCV
-    from sklearn.neural_network import MLPRegressor
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
+    with needs_extra("analysis", "a probe"):
+        from sklearn.linear_model import RidgeCV
+        from sklearn.neural_network import MLPRegressor
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
 
     if kind == "linear":
         return make_pipeline(StandardScaler(), RidgeCV(ALPHAS))

@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import importlib.util
 import json
 import shlex
 import sys
@@ -15,6 +14,7 @@ from sb3_abisim.benchmark.jobs.job import Job, command_line, is_by_other_code, i
 from sb3_abisim.benchmark.jobs.local import Engine, make_engine, run_jobs
 from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.common.cli import PROGRAM, add_trust, make_parser, run
+from sb3_abisim.common.extras import require_extra
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.hashes import write_hashes
 from sb3_abisim.common.text import printable
@@ -48,7 +48,7 @@ def _run_parser() -> argparse.ArgumentParser:
         "benchmark -o benchmark --env PointMaze-v0 --methods abisim ssi vanilla --seeds 0 1 2",
     )
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
-    parser.add_argument("--methods", nargs="+", metavar="METHOD[=ENCODER][,frozen]",
+    parser.add_argument("--methods", nargs="+", metavar="METHOD[=ENCODER][,frozen][,OPTION=VALUE]",
                         help=f"such as {', '.join(methods())}; without an encoder, it is pretrained; {{seed}} in an "
                         "encoder's name becomes the seed of pretraining (default: all but foreign)")  # fmt: skip
     parser.add_argument("--env", nargs="+", default=list(DEFAULT_ENV_IDS), metavar="ID",
@@ -137,9 +137,7 @@ def _list(root: Path, jobs: list[Job]) -> None:
 
 
 def _require_report() -> None:
-    missing = [name for name in ("matplotlib", "rliable", "jinja2") if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ValueError(f"{' and '.join(missing)} not installed; run: pip install 'sb3_abisim[benchmark]'")
+    require_extra("benchmark", "a report", "matplotlib", "rliable", "jinja2", "scipy")
 
 
 def _report_parser() -> argparse.ArgumentParser:

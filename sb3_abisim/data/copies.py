@@ -227,6 +227,9 @@ class EnvCopies(VectorEnv[Any, Any, Any]):
     :param image_key: see :meth:`ImageLayout.of`
     """
 
+    # What is closed when making the copies fails: Gymnasium 1.2 closes what was never made.
+    envs: Sequence[gym.Env[Any, Any]] = ()
+
     def __init__(self, make_fns: Sequence[MakeFn], image_key: str | None = None) -> None:
         self.envs = [make_fn() for make_fn in make_fns]
         self.layout = ImageLayout.of(self.envs[0].observation_space, image_key)
@@ -289,7 +292,7 @@ class EnvCopies(VectorEnv[Any, Any, Any]):
         """What else the present observations hold: name to (n, ...); zeros before the first reset."""
         return {name: np.stack([rest[name] for rest in self._rest]) for name in self.layout.factors}
 
-    def close(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: Any) -> None:
         """Close every copy."""
         for env in self.envs:
             env.close()
@@ -367,7 +370,7 @@ class WorkerCopies(EnvCopies):
             answers.append(answer)
         return answers
 
-    def close(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: Any) -> None:
         """End the workers."""
         for pipe in self._pipes:
             # Workers hold ends of each other's pipes where they were forked: closing ours does not end them.

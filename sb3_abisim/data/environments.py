@@ -95,6 +95,8 @@ def make_vector_env(
 # What the errors of environments and wrappers say, and what helps.
 _HINTS = (
     (r"requires render_mode", "add --env-kwargs render_mode:rgb_array"),
+    # Wrappers of Gymnasium 1.2 that render assert without a word.
+    (r"^AssertionError AssertionError$", "where a wrapper renders, add --env-kwargs render_mode:rgb_array"),
     (r"(?i)opengl|glfw|egl|osmesa", "rendering without a display needs MUJOCO_GL=egl in front of the command"),
     (r"to be a tuple, got .*list", "a YAML has lists only; rl_zoo3.wrappers.YAMLCompatResizeObservation takes one"),
 )

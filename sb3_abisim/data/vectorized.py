@@ -99,7 +99,7 @@ class VectorizedCopies(EnvCopies):
             return [{key: part[i] for key, part in observations.items()} for i in range(self.num_envs)]
         return list(observations)
 
-    def close(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: Any) -> None:
         """Close the environment, if it was made for this."""
         if self._owned:
             self._venv.close()

@@ -28,6 +28,7 @@ from safetensors import SafetensorError
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_abisim._version import __version__
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.spaces import space_from_json, space_to_json
@@ -410,9 +411,11 @@ def _download(name: str) -> Path:
         raise ValueError(f"a Hub name looks like hf://owner/repository/file.safetensors, got {name!r}")
     repository, revision, filename = match.groups()
     try:
-        from huggingface_hub import hf_hub_download
+        with needs_extra("hub", name):
+            from huggingface_hub import hf_hub_download
     except ImportError as error:
-        raise EncoderNotFoundError(f"{name} needs the Hub client: pip install huggingface_hub") from error
+        # As for any other file that is not there: a saved model is loaded without it.
+        raise EncoderNotFoundError(str(error)) from error
     try:
         return Path(hf_hub_download(repository, filename, revision=revision))
     except (OSError, ValueError) as error:

@@ -6,7 +6,6 @@ What is written maps uint8 observations to embeddings: SB3's division by 255 and
 """
 
 import argparse
-import importlib.util
 import io
 import logging
 import warnings
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_abisim.common.cli import make_parser, run
+from sb3_abisim.common.extras import require_extra
 from sb3_abisim.common.files import write_atomic
 
 if TYPE_CHECKING:
@@ -46,9 +46,7 @@ def export_encoder(name: str | Path, output: str | Path) -> "EncoderFile":
     output = Path(output)
     if output.suffix not in _NEEDED:
         raise ValueError(f"the output must end in .onnx or .pt2, got {str(output)!r}")
-    missing = [module for module in _NEEDED[output.suffix] if importlib.util.find_spec(module) is None]
-    if missing:
-        raise ImportError(f"{output.suffix} needs {' and '.join(missing)}: pip install 'sb3_abisim[export]'")
+    require_extra("export", f"a file {output.suffix}", *_NEEDED[output.suffix])
     file = load_encoder(name)
     observations, expected = reference_batch(file)
     write, execute = _to_onnx if output.suffix == ".onnx" else _to_program

@@ -19,6 +19,7 @@ from safetensors import SafetensorError
 from torch import nn
 from torch.nn.functional import interpolate
 
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.networks.base import Encoder, find_features_dim
 from sb3_abisim.registry import register_network_family
 
@@ -111,11 +112,8 @@ def make_timm(
 
 def _import_timm(member: str) -> ModuleType:
     try:
-        import timm
-    except ImportError as error:
-        raise ImportError(
-            f"the network {FAMILY}/{member} needs timm ({error}): pip install 'sb3_abisim[timm]'"
-        ) from error
+        with needs_extra("timm", f"the network {FAMILY}/{member}"):
+            import timm
     except RuntimeError as error:
         raise ImportError(
             f"timm cannot be imported ({error}); install the torchvision that belongs to torch {th.__version__}, from "

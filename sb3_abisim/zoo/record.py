@@ -4,7 +4,6 @@ rl-zoo3's ``record_video`` makes an MP4. A GIF plays in a README and in any brow
 """
 
 import argparse
-import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_abisim.common.cli import add_trust, make_parser, run
+from sb3_abisim.common.extras import needs_extra, require_extra
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_traits
 from sb3_abisim.zoo.run_envs import final_model, make_run_env, split_kwargs
@@ -112,7 +112,8 @@ class _Watched(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _frame(rendered: Any) -> "Image.Image":
-    from PIL import Image
+    with needs_extra("plots", "a GIF"):
+        from PIL import Image
 
     small = Image.fromarray(rendered).resize((PIXELS, PIXELS))
     # Of Pillow's ways to choose 256 colors this one keeps the red of the small agent.
@@ -138,8 +139,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _command(args: argparse.Namespace) -> None:
-    if importlib.util.find_spec("PIL") is None:
-        raise ValueError("a GIF needs Pillow; run: pip install 'sb3_abisim[plots]'")
+    require_extra("plots", "a GIF", "PIL")
     if not args.output.absolute().parent.is_dir():
         raise ValueError(f"there is no folder {args.output.parent} for {args.output.name}; make it first")
     success = record(args.run, args.output, args.episodes, args.seed, args.trust)

@@ -78,7 +78,7 @@ def test_what_the_report_needs_is_said_before_the_work(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rliable" else find_spec(name))
     with pytest.raises(SystemExit):
         main(["-o", str(tmp_path / "new")])
-    assert "rliable not installed; run: pip install 'sb3_abisim[benchmark]'" in capsys.readouterr().err
+    assert "there is no rliable); run: pip install 'sb3_abisim[benchmark]'" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

@@ -62,5 +62,5 @@ def test_hub_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(ValueError, match="looks like"):
             resolve_encoder(name)
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(EncoderNotFoundError, match="pip install huggingface_hub"):
+    with pytest.raises(EncoderNotFoundError, match=r"pip install 'sb3_abisim\[hub\]'"):
         resolve_encoder("hf://me/repo/b")

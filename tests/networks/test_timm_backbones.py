@@ -184,7 +184,7 @@ def test_pretrained_and_fine_tuned(tmp_path: Path, timm: Any) -> None:
 @pytest.mark.parametrize(
     ("module", "message"),
     [
-        (None, r"the network timm/resnet18 needs timm .*pip install 'sb3_abisim\[timm\]'"),
+        (None, r"the network timm/resnet18 needs more packages .*pip install 'sb3_abisim\[timm\]'"),
         (RuntimeError("operator torchvision::nms does not exist"), "install the torchvision that belongs to torch"),
     ],
 )

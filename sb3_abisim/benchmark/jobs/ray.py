@@ -15,6 +15,7 @@ from typing import Any
 from sb3_abisim._version import __version__
 from sb3_abisim.benchmark.jobs.job import Job
 from sb3_abisim.benchmark.jobs.launch import JobError, launch
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.common.files import write_atomic
 
 
@@ -32,10 +33,8 @@ class RayEngine:
     def __init__(
         self, n_jobs: int | None = None, threads: int = 1, address: str = "auto", gpus: float = 0.0, retries: int = 3
     ) -> None:
-        try:
+        with needs_extra("distributed", "--engine ray"):
             import ray
-        except ImportError as error:
-            raise ValueError("Ray is not installed; run: pip install 'sb3_abisim[distributed]'") from error
         if n_jobs is not None and n_jobs < 1:
             raise ValueError(f"n_jobs must be at least 1, got {n_jobs}")
         self._ray = ray

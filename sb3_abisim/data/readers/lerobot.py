@@ -9,6 +9,7 @@ They are read with PyArrow and PyAV. An episode of L frames has L actions; what 
 that it has L - 1 transitions. Frames are found by their timestamps, never by their number. Videos are lossy.
 """
 
+import importlib
 import os
 import re
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.common.spaces import ActionSpace
 from sb3_abisim.data.copies import ImageLayout, factor_name
 from sb3_abisim.data.format import TRUNCATED, from_json_file
@@ -34,7 +36,6 @@ ACTION = "action"
 _NUMBERING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
-_MISSING = 'reading LeRobot folders needs PyArrow and PyAV ({}); run: pip install "sb3_abisim[lerobot]"'
 
 
 def import_lerobot(
@@ -282,12 +283,8 @@ def _is_number(feature: dict[str, Any]) -> bool:
 
 
 def _import(name: str) -> Any:
-    import importlib
-
-    try:
+    with needs_extra("lerobot", "LeRobot's format"):
         return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(_MISSING.format(error)) from None
 
 
 def _read_table(path: Path, names: list[str]) -> dict[str, NDArray[Any]]:

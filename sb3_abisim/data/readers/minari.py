@@ -22,6 +22,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.common.spaces import fit_actions, space_from_json, space_to_json
 from sb3_abisim.data.copies import LAST, ImageLayout
 from sb3_abisim.data.dataset import TransitionDataset
@@ -163,11 +164,9 @@ def _verified(segments: Iterable[Segment], dataset_id: str, metadata: dict[str, 
 
 
 def _import_minari() -> Any:
-    try:
+    with needs_extra("minari", "Minari's format"):
         import h5py  # noqa: F401
         import minari
-    except ImportError as error:
-        raise ImportError(f'Minari is not installed ({error}); run: pip install "sb3_abisim[minari]"') from None
     return minari
 
 

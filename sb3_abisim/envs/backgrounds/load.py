@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 
 from sb3_abisim.common.arguments import checked_arguments
+from sb3_abisim.common.extras import require_extra
 from sb3_abisim.envs.backgrounds.clips import SPLITS, Backgrounds
 from sb3_abisim.envs.backgrounds.photo_pan import photo_pan
 
@@ -43,6 +44,7 @@ def load_backgrounds(
         raise ValueError(f"min_frames must be at least 2, got {min_frames}")
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error must be 'raise' or 'skip', got {on_error!r}")
+    require_extra("video", "videos= of your own (the built-in ones need nothing)", "av", "PIL")
     from sb3_abisim.envs.backgrounds import video_cache, video_files
 
     sources = video_files.find_sources(Path(source))

@@ -62,7 +62,7 @@ def open_container(path: Path) -> Iterator[Any]:
     :raises av.FFmpegError: if it is none of the formats that are read
     """
     # Titles and the like may be in any encoding.
-    av = _import_decoder("av")
+    av = importlib.import_module("av")
     with path.open("rb") as file, av.open(file, options=dict(_OPTIONS), metadata_errors="ignore") as container:
         yield container
 
@@ -76,7 +76,7 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
         file whose frame rate varies)
     :raises ImportError: if the decoder is not installed
     """
-    av = _import_decoder("av")
+    av = importlib.import_module("av")
     count, end, length, n_pixels = 0, 0.0, None, 0
     most = _MAX_PIXELS + _MAX_PIXELS_PER_BYTE * path.stat().st_size
     try:
@@ -122,7 +122,7 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
 def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", float]:
     """A frame as it is shown, and the aspect of its pixels then."""
     # Its own to_image keeps more of them in memory.
-    image = _import_decoder("PIL.Image").fromarray(frame.to_ndarray(format="rgb24"))
+    image = importlib.import_module("PIL.Image").fromarray(frame.to_ndarray(format="rgb24"))
     matrix = next((data for data in frame.side_data if data.type.name == "DISPLAYMATRIX"), None)
     if matrix is None:
         return image, aspect
@@ -135,13 +135,13 @@ def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", floa
     name = _TRANSPOSITIONS[rows]
     if name is None:
         return image, aspect
-    turned = image.transpose(_import_decoder("PIL.Image").Transpose[name])
+    turned = image.transpose(importlib.import_module("PIL.Image").Transpose[name])
     return turned, aspect if rows[0] else 1 / aspect
 
 
 def _video_stream(container: Any, path: Path) -> Any:
     """The video, which is no cover image."""
-    cover = _import_decoder("av.stream").Disposition.attached_pic
+    cover = importlib.import_module("av.stream").Disposition.attached_pic
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
         raise ClipError(f"{path} holds no video{' but a cover' * bool(container.streams.video)}; remove it")
@@ -204,7 +204,7 @@ def expected_frames(source: Source) -> int:
         return len(source.files)
     if source.path.suffix.lower() == ".webp":
         return 0
-    av = _import_decoder("av")
+    av = importlib.import_module("av")
     try:
         with open_container(source.path) as container:
             return _promise(container, source.path)[0] or 0
@@ -213,8 +213,8 @@ def expected_frames(source: Source) -> int:
 
 
 def _decode_images(source: Source) -> Iterator["Image.Image"]:
-    image_module = _import_decoder("PIL.Image")
-    ops = _import_decoder("PIL.ImageOps")
+    image_module = importlib.import_module("PIL.Image")
+    ops = importlib.import_module("PIL.ImageOps")
     _check_numbers(source)
     for file in source.files:
         try:
@@ -233,7 +233,7 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
 
 def _decode_webp(path: Path) -> Iterator["Image.Image"]:
     """The images of an animated WebP."""
-    image_module = _import_decoder("PIL.Image")
+    image_module = importlib.import_module("PIL.Image")
     require_whole(path)
     try:
         with image_module.open(path) as image:
@@ -274,7 +274,7 @@ def shrink(image: "Image.Image", aspect: float = 1.0) -> NDArray[np.uint8]:
     :param image: of any size and mode
     :param aspect: width of a pixel over its height
     """
-    box = _import_decoder("PIL.Image").Resampling.BOX
+    box = importlib.import_module("PIL.Image").Resampling.BOX
     # Of the square as it is shown, in units of the height of a pixel.
     side = min(image.width * aspect, image.height)
     left, top = (image.width - side / aspect) / 2, (image.height - side) / 2
@@ -283,13 +283,3 @@ def shrink(image: "Image.Image", aspect: float = 1.0) -> NDArray[np.uint8]:
     region = (left, top, left + side / aspect, top + side)
     small = image.convert("RGB").resize((SIZE, SIZE), box, box=region)
     return np.ascontiguousarray(np.asarray(small).transpose(2, 0, 1))
-
-
-def _import_decoder(module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(
-            f"custom videos need PyAV and Pillow ({error}): pip install 'sb3_abisim[video]', "
-            "or leave out videos= to use the built-in backgrounds"
-        ) from error

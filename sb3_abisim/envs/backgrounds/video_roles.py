@@ -136,10 +136,8 @@ def require_images(sources: Iterable[_Clip]) -> None:
 
 
 def _kind(file: Path) -> str | None:
-    try:
-        from PIL import Image
-    except ImportError:
-        return None  # decoding will say so
+    from PIL import Image
+
     try:
         with Image.open(file) as image:
             if image.mode.startswith(("I", "F")):

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.extras import require_extra
 from sb3_abisim.envs.base import BatchEnv, SingleEnv
 from sb3_abisim.envs.point_maze.top_down import enlarge
 from sb3_abisim.envs.scan_nav.map import ScanMap
@@ -102,6 +103,7 @@ class ScanNavVectorEnv(BatchEnv):
         min_ratio: float | None = None,
         goals_per_scene: int = 256,
     ) -> None:
+        require_extra("scan", "ScanNav", "scipy", "PIL")
         _check_choice("obs_mode", obs_mode, OBS_MODES)
         _check_choice("marker", marker, tuple(MARKERS))
         _check_choice("stop", stop, ("action", "auto"))

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.common.arrays import read_npz
+from sb3_abisim.common.extras import require_extra
 from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.common.vocabulary import current_scan_map
@@ -100,6 +101,7 @@ class ScanMap:
         :param settings: those of :class:`MapSettings`
         :raises SceneError: for whatever is wrong with the file, see docs/scan_nav.md
         """
+        require_extra("scan", "a map of a scan", "scipy", "PIL")
         path, given = Path(path), _settings(settings)
         content = [file_hash(path), path.name] if path.is_file() else None
 
@@ -123,6 +125,7 @@ class ScanMap:
         :param cache: whether to look in the cache, and write to it
         :param settings: those of :class:`MapSettings`, but those of files
         """
+        require_extra("scan", "a map", "scipy", "PIL")
         from sb3_abisim.envs.scan_nav.apartment import VERSION, apartment_mesh
 
         for name in ("up", "meters_per_unit", "flip_faces", "allow_implausible"):
