@@ -13,6 +13,7 @@ from sb3_abisim.registry import is_import_path
 from sb3_abisim.zoo.guard import GUARDED, guarded
 from sb3_abisim.zoo.manager import MethodExperimentManager
 from sb3_abisim.zoo.methods import grammar
+from sb3_abisim.zoo.whole_files import saves_whole
 
 # The commands of rl-zoo3 by name: the module, and an example.
 SCRIPTS = {
@@ -75,7 +76,11 @@ def main(argv: Sequence[str]) -> None:
         sys.argv = [prog, *words]
         # rl_zoo3.plots imports its commands, which runpy would warn of.
         warnings.filterwarnings("ignore", "'rl_zoo3.plots", RuntimeWarning)
-        with guarded() if command in GUARDED and not is_trusted else contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            if command in GUARDED and not is_trusted:
+                stack.enter_context(guarded())
+            if command == "train":
+                stack.enter_context(saves_whole())
             runpy.run_module(module, run_name="__main__")
     except FloatingPointError as error:
         # Training has stopped, and no final model was saved.
