@@ -11,8 +11,11 @@ import numpy as np
 
 # Shares of all steps, by how fast an environment is.
 SHARES = {
-    "Nav2D-v0": 0.2, "Nav2DCorridor-v0": 0.2, "Nav2DMaze-v0": 0.2, "PointMaze-v0": 0.08, "ContinuousPointMaze-v0": 0.08,
-    "DistractorPointMaze-v0": 0.08, "ContinuousDistractorPointMaze-v0": 0.08,
+    "Nav2D-v0": 0.2, "Nav2DCorridor-v0": 0.15, "Nav2DMaze-v0": 0.15, "Nav2DRandomGoal-v0": 0.1,
+    "PointMaze-v0": 0.04, "ContinuousPointMaze-v0": 0.04,
+    "PointMazeRandomGoal-v0": 0.04, "ContinuousPointMazeRandomGoal-v0": 0.04,
+    "DistractorPointMaze-v0": 0.04, "ContinuousDistractorPointMaze-v0": 0.04,
+    "DistractorPointMazeRandomGoal-v0": 0.04, "ContinuousDistractorPointMazeRandomGoal-v0": 0.04,
     "ScanNav-v0": 0.06, "ScanNavPaper-v0": 0.02,
 }  # fmt: skip
 N_ENVS = 16
