@@ -63,7 +63,7 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_malloc
 	$(BIN)/python -m benchmarks.bench_collect
 
-reliability: setup  ## damaged and hostile files, kills, steps and NaN, counted, into docs/reliability.md; half an hour
+reliability: setup  ## damaged and hostile files, kills, steps and NaN, counted, into docs/limits.md; half an hour
 	$(BIN)/python -m benchmarks.reliability --seed 0
 
 figures: setup  ## make every figure of docs/figures.md again from the committed encoders; about a quarter of an hour

@@ -1,12 +1,14 @@
-"""docs/limits.md: every row of its table has tests, and its numbers are those of the code."""
+"""docs/limits.md: each row of its table has tests, its numbers are those of the code, and each command is in it."""
 
 import re
 from pathlib import Path
 
 import pytest
 
+from sb3_abisim.__main__ import COMMANDS
 from sb3_abisim.common import arrays, spaces, yaml_text
 from sb3_abisim.data.readers import arrays as array_reader
+from sb3_abisim.envs import base
 from sb3_abisim.envs.backgrounds import video_frames
 from sb3_abisim.envs.scan_nav import build, files
 from sb3_abisim.networks import bounded, encoder_file
@@ -17,6 +19,21 @@ PAGE = (ROOT.parent / "docs" / "limits.md").read_text()
 MILLION = 1_000_000
 # Row: numbers as they stand in it, and the tests of what is read and refused.
 ROWS: dict[str, tuple[dict[str, float], list[str]]] = {
+    "arguments of environments": ({"4 GiB": base.MAX_BATCH_BYTES}, [
+        "envs/test_base.py::test_arguments_of_a_wrong_type_are_refused_by_name",
+        "envs/test_base.py::test_unknown_arguments_are_refused_by_name",
+    ]),
+    "actions and steps": ({}, ["envs/test_base.py::test_a_step_after_the_end_is_an_error"]),
+    "observations": ({"33,554,432": spaces.MAX_SPACE_SIZE}, [
+        "data/test_observations_declared.py::test_an_image_that_is_not_declared",
+        "data/test_observations_declared.py::test_a_part_that_is_not_declared",
+    ]),
+    "rewards, observations, actions, losses, weights": ({}, [
+        "zoo/test_folders.py::test_nan_rewards_end_a_run_of_dqn",
+        "rl/test_callbacks.py::test_training_stops_at_a_number_that_is_none",
+        "rl/test_callbacks.py::test_training_stops_at_an_action_that_is_none",
+        "rl/test_callbacks.py::test_training_stops_at_a_loss_or_a_weight_that_is_none",
+    ]),
     "scans": ({"8 million": files.MAX_FACES}, [
         "envs/scan_nav/test_gltf.py::test_what_is_not_known_to_be_read_right_is_refused",
         "envs/scan_nav/test_obj.py::test_what_is_not_known_to_be_read_right_is_refused",
@@ -42,7 +59,7 @@ ROWS: dict[str, tuple[dict[str, float], list[str]]] = {
         "data/test_forged.py::test_spaces_are_bounded",
         "data/test_dataset_damage.py::test_a_pickle_in_place_of_an_array_is_not_run",
     ]),
-    "arrays (`data import arrays`)": ({"512 MiB": array_reader.MAX_UNPACKED_BYTES}, [
+    "arrays": ({"512 MiB": array_reader.MAX_UNPACKED_BYTES}, [
         "data/readers/test_arrays.py::test_what_a_header_declares_is_not_believed",
         "data/readers/test_arrays.py::test_what_an_archive_declares_is_not_believed",
     ]),
@@ -79,19 +96,31 @@ ROWS: dict[str, tuple[dict[str, float], list[str]]] = {
         "zoo/test_run_damage.py::test_what_a_damaged_file_is_called",
         "common/test_arrays.py::test_bombs_and_absent_files",
     ]),
+    "pickles of `zoo all_plots`": ({}, ["zoo/test_guard.py::test_a_pickle_of_curves_needs_trust"]),
     "`benchmark.json`": ({}, ["zoo/test_run_damage.py::test_what_a_damaged_file_is_called"]),
+    "disks, folders and outputs": ({}, [
+        "common/test_files.py::test_full_disk_is_found_out_before_writing",
+        "data/test_collect.py::test_full_disk_is_one_message_and_resumes",
+        "zoo/test_folders.py::test_merge_keeps_the_old_file_on_a_full_disk",
+        "zoo/test_whole_files.py::test_train_keeps_what_it_saved_before_the_disk_was_full",
+    ]),
 }  # fmt: skip
 _UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "million": MILLION, "billion": 1000 * MILLION}
 
 
 def rows() -> dict[str, str]:
-    table = PAGE[: PAGE.index("## Scans")]
+    table = PAGE[: PAGE.index("## Counted")]
     lines = [line for line in table.splitlines() if line.startswith("| ")][1:]
-    return {line.split(" | ")[0].removeprefix("| "): line for line in lines}
+    return {line.split(" | ")[1]: line for line in lines}
 
 
 def test_every_row_is_known() -> None:
     assert list(rows()) == list(ROWS)
+
+
+def test_every_command_is_in_the_table() -> None:
+    words = re.findall(r"`(\w+)", " ".join(line.split(" | ")[0] for line in rows().values()))
+    assert set(words) == set(COMMANDS)
 
 
 @pytest.mark.parametrize("row", ROWS)

@@ -2,7 +2,7 @@
 
 It makes all inputs itself: damaged files of every kind that the package writes, files of a stranger, kills and full
 disks in the middle of commands, random steps in every environment, and numbers that are none in training. Each part is
-kept in ``benchmarks/results/reliability.json`` as soon as it has ended; ``docs/reliability.md`` is the table of it.
+kept in ``benchmarks/results/reliability.json`` as soon as it has ended; ``docs/limits.md`` ends with its tables.
 ``--only`` makes some parts anew, ``--scale 0.01`` is a try of minutes. The exit code is 1 where a count that should be
 0 is not.
 """
@@ -26,7 +26,7 @@ from benchmarks.tables import machine
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results" / "reliability.json"
-PAGE = ROOT / "docs" / "reliability.md"
+PAGE = ROOT / "docs" / "limits.md"
 # At a scale of 1.
 N_STEPS, N_NAN = 1_000_000, 40
 # Imported once, and not in each child.
@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None) -> int:
         "--only", nargs="+", choices=list(parts(Path(), 0, 1)), help="parts to make anew (default: all)"
     )
     parser.add_argument("-o", "--output", type=Path, default=RESULTS, help="JSON file (default: %(default)s)")
-    parser.add_argument("--page", type=Path, default=PAGE, help="page of it (default: %(default)s)")
+    parser.add_argument("--page", type=Path, default=PAGE, help="page that ends with its tables (default: %(default)s)")
     args = parser.parse_args(argv)
     for name in _MODULES:
         __import__(name)
@@ -110,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
                            "rows": rows}  # fmt: skip
             print(part, json.dumps(rows, indent=1), flush=True)
             args.output.write_text(json.dumps(found, indent=1) + "\n")
-    args.page.write_text(page(found))
+    args.page.write_text(page(args.page.read_text(), found))
     failed = breaches(found)
     print("\n".join(failed) or "no breaches")
     return 1 if failed else 0

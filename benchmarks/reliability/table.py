@@ -1,4 +1,4 @@
-"""The page of the counts."""
+"""The tables of the counts, and their place in docs/limits.md."""
 
 import textwrap
 from typing import Any
@@ -49,16 +49,16 @@ _TITLES = {
         "`EncoderCallback`.",
     ),
 }  # fmt: skip
-_HEAD = """# Reliability, counted
-
+# What stands below it in docs/limits.md is written by this module.
+HEADING = "## Counted\n"
+_HEAD = """
 `python -m benchmarks.reliability --seed 0` makes every input of these tables itself, and the tables from
 [its counts](../benchmarks/results/reliability.json). A small part of it runs in every test.
-[limits.md](limits.md) says what each input may contain.
 """
 
 
-def page(found: dict[str, Any]) -> str:
-    """The page.
+def tables(found: dict[str, Any]) -> str:
+    """What stands below :data:`HEADING`.
 
     :param found: the parts by name, as the JSON file holds them
     """
@@ -66,8 +66,21 @@ def page(found: dict[str, Any]) -> str:
     for part, (title, first, text) in _TITLES.items():
         if part in found:
             table = _table(part, first, found[part]["rows"])
-            blocks.append("\n\n".join([f"## {title}", textwrap.fill(text, 120), table, _how(found[part])]) + "\n")
+            blocks.append("\n\n".join([f"### {title}", textwrap.fill(text, 120), table, _how(found[part])]) + "\n")
     return "\n".join(blocks)
+
+
+def page(before: str, found: dict[str, Any]) -> str:
+    """A page with the tables of these counts in place of those that it ends with.
+
+    :param before: the page
+    :param found: as for :func:`tables`
+    :raises ValueError: for a page without their heading
+    """
+    head, heading, _ = before.partition(HEADING)
+    if not heading:
+        raise ValueError(f"the page has no line {HEADING.strip()!r}, below which the tables go")
+    return head + heading + tables(found)
 
 
 def _how(part: dict[str, Any]) -> str:
@@ -88,7 +101,7 @@ def _table(part: str, first: str, rows: dict[str, Any]) -> str:
 def breaches(found: dict[str, Any]) -> list[str]:
     """What should be 0 and is not, with examples.
 
-    :param found: as for :func:`page`
+    :param found: as for :func:`tables`
     """
     lines = []
     for part, aims in AIMS.items():
