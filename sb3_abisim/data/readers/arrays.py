@@ -42,7 +42,7 @@ OBSERVATIONS, ACTIONS = "observations", "actions"
 TERMINATIONS, TRUNCATIONS, EPISODE_ENDS = "terminations", "truncations", "episode_ends"
 FACTOR_PREFIX = "factor_"
 # Arrays of .npz files are read into memory; those of .npy files are mapped.
-MAX_UNPACKED_BYTES = 2**32
+MAX_UNPACKED_BYTES = 2**29
 # Deflate makes nothing smaller than this.
 _DEFLATE_RATIO = 1032
 _READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
