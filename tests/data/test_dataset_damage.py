@@ -126,6 +126,15 @@ def test_a_pickle_in_place_of_an_array_is_not_run(copy: Path, tmp_path: Path) ->
     assert not (tmp_path / "executed").exists()
 
 
+def test_a_header_that_never_ends_is_one_sentence(copy: Path) -> None:
+    """NumPy reads it as Python, whose tokenizer raises an error of its own."""
+    path = copy / "actions-00000.npy"
+    path.write_bytes(b"\x93NUMPY\x01\x00\x40\x00" + b"(" * 200)
+    rewrite_meta(copy, json.loads((copy / META_NAME).read_bytes()))
+    with pytest.raises(DatasetError, match=r"actions-00000\.npy is not an array file of a dataset"):
+        TransitionDataset(copy)
+
+
 @pytest.mark.parametrize(
     ("change", "held"),
     [(lambda a: a.astype(np.int32), r"int32 \((\d+),\)"), (lambda a: np.stack([a, a], axis=1), r"int64 \(\d+, 2\)")],

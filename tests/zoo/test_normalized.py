@@ -1,8 +1,11 @@
 """Runs on normalized observations: evaluated, recorded and collected with as Stable-Baselines3 shows them."""
 
+import re
 import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -54,6 +57,39 @@ def test_evaluation_is_that_of_the_unpickled_run(folder: Path) -> None:
         assert found[f"{mode}/standard/results"].tolist() == returns
         assert found[f"{mode}/standard/ep_lengths"].tolist() == lengths
     env.close()
+
+
+@pytest.mark.parametrize("normalize", ["true", '"dict(norm_obs=False, norm_reward=True)"'])
+def test_plain_evaluation_as_in_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, normalize: str) -> None:
+    """The code of docs/zoo.md gives what this package does."""
+    monkeypatch.chdir(tmp_path)
+    Path("custom.yml").write_text(
+        "PointMaze-v0:\n  policy: CnnPolicy\n  n_timesteps: 64\n  n_envs: 2\n  n_steps: 32\n  batch_size: 32\n"
+        f"  n_epochs: 1\n  normalize: {normalize}\n"
+        + ("  policy_kwargs: dict(normalize_images=False)\n" if normalize == "true" else "")
+    )
+    words = ["--algo", "ppo", "--env", "PointMaze-v0", "-f", "logs", "--conf-file", "custom.yml"]
+    run(monkeypatch, "train", *words, "--eval-freq", "-1", "--num-threads", "1", "--seed", "5")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "zoo.md").read_text()
+    (code,) = re.findall(
+        r"```python\n(.*?)```", page.split("## A run in plain Stable-Baselines3")[1].split("\n## ")[0], re.S
+    )
+    scope: dict[str, Any] = {}
+    for old, new in (("16, seed=0", f"3, seed={SEED}"), ("env, 100)", "env, 3)")):
+        assert old in code
+        code = code.replace(old, new)
+    exec(code, scope)
+    folder = Path("logs/ppo/PointMaze-v0_1")
+    made = read_run(folder)
+    ours = make_run_env(made, final_model(made), 3, {}, SEED)
+    scope["env"].seed(SEED)
+    shown = scope["env"].reset()
+    assert np.array_equal(shown, ours.reset()) and (shown.min() < 0) == (normalize == "true")
+    scope["env"].close(), ours.close()
+    evaluate_final(folder, 3)
+    found = made.final()
+    assert found is not None
+    assert scope["mean"] == pytest.approx(found["deterministic/standard/results"].mean(), rel=1e-6)
 
 
 def test_it_is_recorded(folder: Path, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arrays import ARRAY_ERRORS
 from sb3_abisim.common.spaces import fit_actions
 from sb3_abisim.data.copies import ImageLayout
 from sb3_abisim.data.format import CUT, TERMINATED, TRUNCATED
@@ -271,7 +272,7 @@ class _Archive(_Part):
                     _check_header(file, member.file_size, where)
                 with archive.open(member) as file:
                     return np.lib.format.read_array(file, allow_pickle=False)
-        except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError) as error:
+        except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, NotImplementedError) as error:
             raise ValueError(f"{where} cannot be read ({error}); write it again with numpy.savez") from None
 
 
@@ -280,7 +281,7 @@ def _check_header(file: IO[bytes], size: int, where: str) -> None:
     try:
         version = np.lib.format.read_magic(file)
         shape, _, dtype = _READ_HEADER[version](file)
-    except (ValueError, KeyError, EOFError) as error:
+    except ARRAY_ERRORS as error:
         raise ValueError(f"{where} is no array of NumPy's ({error}); write it with numpy.save") from None
     if dtype.hasobject:
         raise ValueError(f"{where} holds Python objects, and to unpickle them can run code; save it as numbers")
