@@ -42,6 +42,8 @@ FORMAT = 1
 REFERENCE_TOLERANCE = 1e-4
 MAX_FILE_BYTES = 1 << 30
 HUB_PREFIX = "hf://"
+# What a repository's encoder is called, where a name gives no file.
+HUB_FILE = "model.safetensors"
 # A zoo run on a frozen encoder keeps a copy of its file under this name, in its folder <env id> beside config.yml.
 RUN_COPY = "encoder.safetensors"
 
@@ -270,8 +272,8 @@ def resolve_encoder(name: str | os.PathLike[str]) -> Path:
     """Find an encoder file.
 
     :param name: a path; else the name of an encoder that comes with the package, such as
-        "DistractorPointMaze-v0/abisim"; or ``hf://owner/repository/file.safetensors``, downloaded from the Hugging Face
-        Hub (``hf://owner/repository@revision/file.safetensors`` for a fixed revision)
+        "DistractorPointMaze-v0/abisim"; or ``hf://owner/repository``, downloaded from the Hugging Face Hub:
+        ``model.safetensors``, or the file behind a further slash. ``hf://owner/repository@revision`` fixes the revision
     :raises EncoderNotFoundError: listing the places searched
     """
     text = os.fspath(name)
@@ -406,10 +408,10 @@ def _check_reference(path: Path, actual: th.Tensor, expected: th.Tensor) -> None
 
 
 def _download(name: str) -> Path:
-    match = re.fullmatch(r"hf://([^/@]+/[^/@]+)(?:@([^/]+))?/(.+)", name)
+    match = re.fullmatch(r"hf://([^/@]+/[^/@]+)(?:@([^/]+))?(?:/(.+))?", name)
     if match is None:
-        raise ValueError(f"a Hub name looks like hf://owner/repository/file.safetensors, got {name!r}")
-    repository, revision, filename = match.groups()
+        raise ValueError(f"a Hub name looks like hf://owner/repository[@revision][/file.safetensors], got {name!r}")
+    repository, revision, filename = match[1], match[2], match[3] or HUB_FILE
     try:
         with needs_extra("hub", name):
             from huggingface_hub import hf_hub_download
