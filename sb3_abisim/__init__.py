@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_abisim import envs as _envs  # noqa: F401  (registers the environments)
 from sb3_abisim._version import __version__
-from sb3_abisim.registry import EnvTraits, register_method, register_network, register_reader, register_traits
+from sb3_abisim.registry import (
+    EnvTraits,
+    register_augmentation,
+    register_method,
+    register_network,
+    register_reader,
+    register_traits,
+)
 
 if TYPE_CHECKING:
     from sb3_abisim.data.collect import collect
@@ -30,7 +37,6 @@ if TYPE_CHECKING:
     from sb3_abisim.rl.combined import CombinedEncoderExtractor
     from sb3_abisim.rl.extractors import EncoderExtractor
     from sb3_abisim.rl.merge import merge_encoder
-    from sb3_abisim.rl.optimizers import EncoderLRAdam
     from sb3_abisim.rl.policy_kwargs import policy_kwargs
     from sb3_abisim.rl.unfreeze import unfreeze_encoder
     from sb3_abisim.rl.vec_encode import VecEncodeObservations
@@ -46,7 +52,6 @@ _PUBLIC = {
     "Encoder": "networks.base",
     "EncoderCallback": "rl.callbacks",
     "EncoderExtractor": "rl.extractors",
-    "EncoderLRAdam": "rl.optimizers",
     "Objective": "objectives.base",
     "PointMazePixels": "envs.point_maze.pixel_wrapper",
     "Segment": "data.writer",
@@ -77,7 +82,6 @@ __all__ = [
     "Encoder",
     "EncoderCallback",
     "EncoderExtractor",
-    "EncoderLRAdam",
     "EnvTraits",
     "Objective",
     "PointMazePixels",
@@ -94,6 +98,7 @@ __all__ = [
     "merge_encoder",
     "policy_kwargs",
     "pretrain",
+    "register_augmentation",
     "register_method",
     "register_network",
     "register_reader",

@@ -136,19 +136,22 @@ def model_lines(path: Path) -> Iterator[Line]:
 
     :param path: the zip
     """
+    import torch as th
+
     from sb3_abisim.zoo.models import read_weights
 
-    data, params = read_weights(path)
-    policy = params.get("policy") or {}
+    data, policy = read_weights(path)
     yield _fact("model", f"{path}, {data.get('num_timesteps', '?')} steps")
-    saved = (
-        str(data.get("policy_class", {}).get("__module__", "?")) if isinstance(data.get("policy_class"), dict) else "?"
-    )
-    yield _fact("policy", f"of {saved}, {sum(weights.numel() for weights in policy.values())} numbers")
+    yield _fact("policy", f"{len(policy)} tensors of {sum(weights.numel() for weights in policy.values())} numbers")
+    # Beside a pickle, Stable-Baselines3 keeps what it stands for as texts.
     kwargs = data.get("policy_kwargs")
-    extractor = str(kwargs.get("features_extractor_class", "")) if isinstance(kwargs, dict) else ""
-    yield _fact("features extractor", extractor or "Stable-Baselines3's default, or not said without unpickling")
-    hashes = {bytes(value.tolist()).hex() for name, value in policy.items() if name.endswith(".encoder_hash")}
+    extractor = kwargs.get("features_extractor_class") if isinstance(kwargs, dict) else None
+    yield _fact("features extractor", str(extractor or "Stable-Baselines3's default"))
+    hashes = {
+        bytes(value.tolist()).hex()
+        for name, value in policy.items()
+        if name.endswith(".encoder_hash") and value.dtype == th.uint8
+    }
     yield _fact("encoder", ", ".join(map(_named, sorted(hashes))) or "none of ours in the model")
     if next(iter(path.parent.glob("*/args.yml")), None) is None:
         yield _fact("loads here", "not tried: a zip alone can only be unpickled; give its run folder")

@@ -1,4 +1,4 @@
-"""What can be added by name: methods, networks, dataset readers, and what is known of an environment.
+"""What can be added by name: methods, networks, augmentations, dataset readers, and what is known of an environment.
 
 The ground floor: nothing of this package is imported here. What the package itself brings registers itself when the
 folder that holds it is imported, which happens at the first look-up. Other packages register in the same way: by
@@ -38,6 +38,7 @@ class Method:
     :param hyperparams: YAML file of its pretraining settings by environment id; None for this package's
         ``hyperparams/pretrain/<name>.yml``, or where there is none for the defaults
     :param trained_elsewhere: whether its encoders come from files that nothing here pretrains
+    :param augment: what its features extractor augments observations by, unless it is told otherwise
     """
 
     name: str
@@ -50,6 +51,7 @@ class Method:
     results: tuple[str, ...]
     hyperparams: str | os.PathLike[str] | None
     trained_elsewhere: bool = False
+    augment: str | None = None
 
     @property
     def is_pretrained(self) -> bool:
@@ -136,9 +138,9 @@ class _Records(Generic[RecordT]):
 
     def add(self, name: str, record: RecordT) -> None:
         if not _NAME.fullmatch(name):
-            raise ValueError(f"a {self.kind}'s name is made of letters, digits, '_', '-' and '.', got {name!r}")
+            raise ValueError(f"the {self.kind}'s name must be made of letters, digits, '_', '-' and '.', got {name!r}")
         if name in self.by_name:
-            raise ValueError(f"there is a {self.kind} {name!r} already; give yours another name")
+            raise ValueError(f"the {self.kind} {name!r} is registered already; give yours another name")
         self.by_name[name] = record
 
     def all(self) -> dict[str, RecordT]:
@@ -160,6 +162,8 @@ _NETWORKS: _Records[Network] = _Records("network", "sb3_abisim.networks")
 _IMPORTED_NETWORKS: dict[str, Network] = {}
 # Networks that another library knows by name: FAMILY/MEMBER.
 _NETWORK_FAMILIES: _Records[Callable[..., Any]] = _Records("family of networks", "sb3_abisim.networks")
+# From float observations (batch, channels, height, width) in 0..1, and keyword arguments, to augmented ones.
+_AUGMENTATIONS: _Records[Callable[..., Any]] = _Records("augmentation", "sb3_abisim.networks")
 _READERS: _Records[Reader] = _Records("reader", "sb3_abisim.data.readers")
 _TRAITS: dict[str, EnvTraits] = {}
 _NAMED_PACKAGES: set[str] = set()
@@ -178,6 +182,7 @@ def register_method(
     results: tuple[str, ...] = ("accuracy",),
     hyperparams: str | os.PathLike[str] | None = None,
     trained_elsewhere: bool = False,
+    augment: str | None = None,
 ) -> None:
     """Add a method; its features extractor is then importable from ``sb3_abisim``.
 
@@ -191,6 +196,7 @@ def register_method(
     :param results: see :class:`Method`
     :param hyperparams: see :class:`Method`
     :param trained_elsewhere: see :class:`Method`
+    :param augment: see :class:`Method`
     :raises ValueError: for a name that is taken or cannot be one
     """
     class_name = extractor or "".join(part.capitalize() for part in re.split(r"[_.-]", name)) + "Extractor"
@@ -198,7 +204,7 @@ def register_method(
         if other.extractor == class_name:
             raise ValueError(f"{class_name} is the extractor of method {other.name!r}; give another with extractor=")
     record = Method(
-        name, objective, label or name, class_name, base, color, curve, results, hyperparams, trained_elsewhere
+        name, objective, label or name, class_name, base, color, curve, results, hyperparams, trained_elsewhere, augment
     )
     _METHODS.add(name, record)
 
@@ -226,6 +232,17 @@ def register_network_family(name: str, factory: Callable[..., Any]) -> None:
     :raises ValueError: for a name that is taken or cannot be one
     """
     _NETWORK_FAMILIES.add(name, factory)
+
+
+def register_augmentation(name: str, augment_fn: Callable[..., Any]) -> None:
+    """Add an augmentation; features extractors take ``augment=name`` and ``augment_kwargs``.
+
+    :param name: its name
+    :param augment_fn: called with float observations (batch, channels, height, width) in 0..1 and the keyword
+        arguments; returns new ones of the same shape. It samples from torch's global generator
+    :raises ValueError: for a name that is taken or cannot be one
+    """
+    _AUGMENTATIONS.add(name, augment_fn)
 
 
 def register_reader(name: str, read_fn: Callable[..., str], *, help: str = "") -> None:
@@ -305,9 +322,9 @@ def is_known_network(name: str) -> bool:
 
 
 def is_import_path(name: str | None) -> bool:
-    """Whether a network's name is an import path, ``pkg.module:Factory``.
+    """Whether a name is an import path, ``pkg.module:Factory``.
 
-    :param name: of a network, None for the default one
+    :param name: of a network or an augmentation, None for the default one
     """
     return name is not None and ":" in name
 
@@ -320,18 +337,32 @@ def import_network(name: str) -> None:
     :param name: ``pkg.module:Factory``, a factory as for :func:`register_network`, such as a module's class
     :raises ValueError: for something that cannot be imported or called
     """
-    if name in _IMPORTED_NETWORKS:
-        return
+    if name not in _IMPORTED_NETWORKS:
+        _IMPORTED_NETWORKS[name] = Network(name, _import("network", name, "Factory"), None)
+
+
+def _import(kind: str, name: str, example: str) -> Callable[..., Any]:
+    """What an import path names."""
     module, _, attribute = name.partition(":")
     try:
-        factory = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
+        found = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"cannot import the network {name!r} ({error}); give pkg.module:Factory, and install it or set PYTHONPATH"
+            f"cannot import the {kind} {name!r} ({error}); give pkg.module:{example}, and install it or set PYTHONPATH"
         ) from error
-    if not callable(factory):
-        raise ValueError(f"the network {name!r} is no factory but {factory!r}; name a class or a function")
-    _IMPORTED_NETWORKS[name] = Network(name, factory, None)
+    if not callable(found):
+        raise ValueError(f"the {kind} {name!r} is no {example.lower()} but {found!r}; name a class or a function")
+    imported: Callable[..., Any] = found
+    return imported
+
+
+def get_augmentation(name: str) -> Callable[..., Any]:
+    """The augmentation of a name.
+
+    :param name: e.g. "random_shift", or ``pkg.module:Function``, which is imported: never a name that only a file holds
+    :raises ValueError: for an unknown one, naming those that are known, or something that cannot be imported
+    """
+    return _import("augmentation", name, "Function") if is_import_path(name) else _AUGMENTATIONS.get(name)
 
 
 def readers() -> dict[str, Reader]:

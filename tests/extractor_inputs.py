@@ -103,7 +103,14 @@ def write(path: Path, network: str | None = None, objective: str = "abisim", **k
     return path
 
 
-def build(name: str, path: Path | str, freeze: bool, other_sharing: bool = False, **kwargs: Any) -> Any:
+def build(
+    name: str,
+    path: Path | str,
+    freeze: bool,
+    other_sharing: bool = False,
+    more_policy_kwargs: dict[str, Any] | None = None,
+    **kwargs: Any,
+) -> Any:
     algorithm, settings = ALGORITHMS[name]
     policy_kwargs: dict[str, Any] = {
         "features_extractor_class": ActionBisimExtractor,
@@ -115,6 +122,17 @@ def build(name: str, path: Path | str, freeze: bool, other_sharing: bool = False
         policy_kwargs["share_features_extractor"] = SHARING[name]
     if name == "RecurrentPPO":
         policy_kwargs["lstm_hidden_size"] = 8
+    policy_kwargs |= more_policy_kwargs or {}
     policy = "CnnLstmPolicy" if name == "RecurrentPPO" else "CnnPolicy"
     env = RandomImages(continuous=name in ("SAC", "TD3", "TQC"))
     return algorithm(policy, env, seed=5, device="cpu", policy_kwargs=policy_kwargs, **settings)
+
+
+def dim(observations: th.Tensor, factor: float = 0.5) -> th.Tensor:
+    """An augmentation that is not random."""
+    return observations * factor
+
+
+def narrow(observations: th.Tensor) -> th.Tensor:
+    """No augmentation: another shape."""
+    return observations[:, :, 1:]

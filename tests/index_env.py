@@ -85,3 +85,10 @@ class PlainEnv(gym.Env):
 
 gym.register("IndexEnv-v0", entry_point=PlainEnv, vector_entry_point=IndexVectorEnv, max_episode_steps=LIMIT)
 gym.register("PlainEnv-v0", entry_point=PlainEnv, max_episode_steps=LIMIT)
+
+
+class SilentWrapper(gym.Wrapper[Any, Any, Any, Any]):
+    """Does not take any environment, and does not say why."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        raise AssertionError

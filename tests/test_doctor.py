@@ -1,6 +1,7 @@
 """The doctor says what is there, and what is wrong, and executes nothing."""
 
 import base64
+import io
 import json
 import os
 import pickle
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch as th
 from packaging.requirements import Requirement
 from stable_baselines3 import PPO
 from zoo_inputs import SMALL, run, write_encoder
@@ -102,6 +104,17 @@ def test_a_run_and_its_model(
     assert code == 1 and "1 fault," in err and f"! {ENV_ID}.zip loads here" in out
     model.unlink()
     assert diagnose(capsys, str(folder))[0] == 1
+
+
+@pytest.mark.parametrize("weights", [{"a": th.zeros(1).expand(10**13)}, {"a": 1}, [1]])
+def test_weights_that_are_none_are_refused(weights: Any, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    th.save(weights, stream)
+    with zipfile.ZipFile(tmp_path / "m.zip", "w") as archive:
+        archive.writestr("data", "{}")
+        archive.writestr("policy.pth", stream.getvalue())
+    code, out, err = diagnose(capsys, str(tmp_path / "m.zip"))
+    assert code == 2 and not out and "no model of Stable-Baselines3" in err
 
 
 def booby_trap(source: Path, target: Path, mark: Path) -> None:

@@ -59,8 +59,8 @@ def run(folder: Path, cwd: Path, *words: str, code: int = 0) -> str:
 
 def test_the_page_has_a_module_for_each_kind() -> None:
     text = "".join(modules().values())
-    for name in ("register_method(", "register_network(", "register_traits(", "register_reader("):
-        assert name in text
+    for name in ("method", "network", "augmentation", "traits", "reader"):
+        assert f"register_{name}(" in text
 
 
 @pytest.mark.parametrize("by", ["packages", "entry point"])
@@ -75,11 +75,13 @@ def test_everything_runs_with_what_a_package_adds(package: Path, plugin: Path, t
     card = json.loads((tmp_path / "dot.json").read_bytes())
     assert "train/prediction_error" in card["curves"] and card["features_dim"] == 32
     budget = ["-n", "64", "--eval-freq", "-1", "-f", "logs", "-params", *SMALL_PPO]
-    for spec, label in (("self_prediction=dot.safetensors", False), ("self_prediction=dot.safetensors,frozen", True)):
+    augmented = "self_prediction=dot.safetensors,augment=cutout"
+    for spec, label in ((augmented, False), ("self_prediction=dot.safetensors,frozen", True)):
         output = run(folder, tmp_path, "train", *flag, "--algo", "ppo", *env, "--conf-file", spec, *budget)
         assert "Encoder" in output or "callback" not in output
         record = json.loads(max((tmp_path / "logs").glob("ppo/*/*/method.json"), key=os.path.getmtime).read_bytes())
         assert (record["method"], record["frozen"]) == ("self_prediction", label)
+        assert record["augment"] == (None if label else "cutout")
         assert record["encoder_hash"]
     run(folder, tmp_path, "analyze", "probes", *flag, *env, "dot.safetensors", "-n", "20", "--images", "figures")
     probes = json.loads((tmp_path / "figures" / "probes-my-Dot-v0.json").read_bytes())

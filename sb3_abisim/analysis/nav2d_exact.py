@@ -24,6 +24,7 @@ from sb3_abisim.common.grids import fewest_steps, flood_fill, pack, unpack
 from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.nav2d import CHANNELS, GOAL, SIZE, Nav2DVectorEnv, next_cells
 from sb3_abisim.networks.base import Encoder
+from sb3_abisim.registry import get_traits
 
 N_CELLS = SIZE * SIZE
 GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
@@ -74,11 +75,23 @@ def check_nav2d(env_id: str) -> None:
     """Refuse environments whose cells cannot be toggled.
 
     :param env_id: an id of Nav2D, that is of :class:`~sb3_abisim.envs.nav2d.Nav2DVectorEnv` or a subclass
-    :raises ValueError: for any other
+    :raises ValueError: for any other, or one whose goal is not in the center
     """
     found = batch_class(env_id)
     if found is None or not issubclass(found, Nav2DVectorEnv):
         raise ValueError(f"cells can be toggled in Nav2D alone, got {env_id!r}; give an id of it such as Nav2D-v0")
+    check_centered(env_id)
+
+
+def check_centered(env_id: str) -> None:
+    """Refuse an environment with random goals, for what renders states with the goal in the center.
+
+    :param env_id: a registered id
+    :raises ValueError: naming one that has its goal there
+    """
+    if gym.spec(env_id).kwargs.get("goal", "center") != "center":
+        other = get_traits(env_id).same_observations_as or "another id"
+        raise ValueError(f"the goal of {env_id} is not in the center, where this figure shows it; give {other}")
 
 
 def eval_layouts(env_id: str, n_layouts: int, seed: int = EVAL_SEED) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_abisim.analysis.nav2d_exact import embed
+from sb3_abisim.analysis.nav2d_exact import check_centered, embed
 from sb3_abisim.analysis.scenes import Samples, eval_settings, render_point_mazes, sample_episodes
 from sb3_abisim.envs.backgrounds.clips import Backgrounds
 from sb3_abisim.envs.base import batch_class
@@ -80,6 +80,7 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
         raise ValueError(
             f"obstacles can be moved in the point mazes alone, got {env_id!r}; give an id of one such as PointMaze-v0"
         )
+    check_centered(env_id)
     if n_states < 2:
         raise ValueError(f"distances between states need two states or more, got {n_states}")
     encoders: dict[str, Any] = {name: {"hash": file.hash, "settings": {}} for name, file in files.items()}

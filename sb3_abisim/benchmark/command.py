@@ -48,7 +48,7 @@ def _run_parser() -> argparse.ArgumentParser:
         "benchmark -o benchmark --env PointMaze-v0 --methods abisim ssi vanilla --seeds 0 1 2",
     )
     parser.add_argument("-o", "--output", default="benchmark", metavar="DIR", help="folder for everything")
-    parser.add_argument("--methods", nargs="+", metavar="METHOD[=ENCODER][,frozen]",
+    parser.add_argument("--methods", nargs="+", metavar="METHOD[=ENCODER][,frozen][,OPTION=VALUE]",
                         help=f"such as {', '.join(methods())}; without an encoder, it is pretrained; {{seed}} in an "
                         "encoder's name becomes the seed of pretraining (default: all but foreign)")  # fmt: skip
     parser.add_argument("--env", nargs="+", default=list(DEFAULT_ENV_IDS), metavar="ID",

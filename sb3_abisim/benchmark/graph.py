@@ -157,10 +157,12 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     n = plan.n_timesteps or int(entry["n_timesteps"])
     eval_freq = plan.eval_freq or min(PAPER_EVAL_FREQ, max(n // 100, 1))
     settings = {"env_id": env_id, "algo": algo, "seed": seed, "method": method.name, "frozen": method.frozen}
+    # Only what is given, as in benchmarks of before.
+    settings |= method.options
     conf_file, label = method.name, method.name
     if method.encoder is not None:
         file = load_encoder(method.encoder)
-        check_preprocessing(file, {**used, **replaced}, method.frozen)
+        check_preprocessing(file, {**used, **replaced}, method.embeds_in_env)
         settings["encoder_hash"] = file.hash
         label += f"-{file.hash[:6]}"
         path = Path(method.encoder)
@@ -171,19 +173,18 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
         "hyperparams": {**entry, "n_timesteps": n, **given},
         "eval_freq": eval_freq, "eval_episodes": plan.eval_episodes, "n_eval_envs": plan.n_eval_envs,
     }  # fmt: skip
-    frozen = ",frozen" if method.frozen else ""
-    label += "-frozen" if method.frozen else ""
+    label += re.sub(r"[^\w.]+", "-", method.suffix)
     key = job_key("run", settings, inputs)
     # Runs that differ in nothing but seeds share a folder. A number, since the zoo's --exp-id takes one.
     family = f"runs/{_folder(env_id)}/{label}-{job_key('run', settings, inputs, without_seeds=True)[:8]}"
-    command = ["sb3_abisim", "train", "--algo", algo, "--env", env_id, "--conf-file", conf_file + frozen]
+    command = ["sb3_abisim", "train", "--algo", algo, "--env", env_id, "--conf-file", conf_file + method.suffix]
     command += ["-f", f"work/run-{key}", "-n", str(n), "--seed", str(seed), "--eval-freq", str(eval_freq)]
     command += ["--eval-episodes", str(plan.eval_episodes), "--n-eval-envs", str(plan.n_eval_envs)]
     command += ["--num-threads", str(plan.threads), "--device", plan.device, "--verbose", "0"]
     command += ["-params", *words] if words else []
     command += _packages(plan)
     output = f"{family}/{algo}/{_folder(env_id)}_{int(key[:10], 16)}"
-    title = f"{algo} {method.name}{frozen} {env_id} seed {seed}"
+    title = f"{algo} {method.name}{method.suffix} {env_id} seed {seed}"
     return Job("run", title, settings, inputs, tuple(command), output, f"{_folder(env_id)}.zip", n)
 
 
@@ -225,14 +226,14 @@ def run_labels(jobs: list[Job]) -> dict[str, str]:
     labels = dict.fromkeys((run.method for run in runs), "")
     for word in labels:
         method = MethodSpec.parse(word)
-        alike = [m for m in map(MethodSpec.parse, labels) if (m.name, m.frozen) == (method.name, method.frozen)]
+        alike = [m for m in map(MethodSpec.parse, labels) if (m.name, m.suffix) == (method.name, method.suffix)]
         paths = [_parts(m.encoder) for m in alike if m.encoder]
         end: tuple[str, ...] = ()
         if method.encoder and len(alike) > 1:
             parts = _parts(method.encoder)
             ends = (parts[-n:] for n in range(1, len(parts) + 1))
             end = next((end for end in ends if sum(p[-len(end) :] == end for p in paths) == 1), (method.encoder,))
-        labels[word] = method.name + "=" * bool(end) + "/".join(end) + ",frozen" * method.frozen
+        labels[word] = method.name + "=" * bool(end) + "/".join(end) + method.suffix
     return {run.name: labels[run.method] for run in runs}
 
 

@@ -22,7 +22,6 @@ from sb3_abisim.benchmark.jobs.job import Job, is_done
 from sb3_abisim.benchmark.jobs.local import Engine, run_jobs
 from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.benchmark.report import statistics
-from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.text import spreadsheet_cell
 from sb3_abisim.registry import get_objective, methods
@@ -72,8 +71,7 @@ def parse_space(words: Sequence[str], objective: str) -> dict[str, "BaseDistribu
     :return: setting, with its objective in front, to Optuna's distribution
     :raises ValueError: for a word that cannot be read
     """
-    with needs_extra("benchmark", "a sweep"):
-        from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     space: dict[str, BaseDistribution] = {}
     for word in words:
@@ -125,8 +123,7 @@ def sweep(
     :return: all trials in their order
     :raises ValueError: if the arguments do not fit together
     """
-    with needs_extra("benchmark", "a sweep"):
-        import optuna
+    import optuna
 
     if len(plan.methods) != 1 or len(plan.env_ids) != 1:
         raise ValueError(f"a sweep takes one method and one environment, got {plan.methods} and {plan.env_ids}")

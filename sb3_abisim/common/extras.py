@@ -39,11 +39,7 @@ def is_installed(module: str) -> bool:
 
     :param module: at the top level
     """
-    try:
-        return importlib.util.find_spec(module) is not None
-    except ValueError:
-        # Something has put None in its place.
-        return False
+    return importlib.util.find_spec(module) is not None
 
 
 def _message(extra: str, purpose: str, reason: str) -> str:

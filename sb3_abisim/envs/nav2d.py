@@ -13,6 +13,8 @@ SIZE = 15
 N_OBSTACLES = 20
 OBSTACLE_SIZE = 2
 GOAL = (7, 7)
+# Places of the goal with goal="corners": four cells from the edges.
+CORNERS = ((3, 3), (11, 3), (3, 11), (11, 11))
 # (dx, dy) of actions 0 to 3; x points right, y points down: up, down, left, right.
 MOVES = ((0, -1), (0, 1), (-1, 0), (1, 0))
 CHANNELS = ("agent", "obstacles", "goal")
@@ -44,6 +46,7 @@ _CELL_PIXELS = 32
 
 _N_CELLS = SIZE * SIZE
 _GOAL_CELL = GOAL[1] * SIZE + GOAL[0]
+_CORNER_CELLS = np.array([y * SIZE + x for x, y in CORNERS])
 # Bitboards of :mod:`~sb3_abisim.common.grids`; their sixteenth column is never free.
 _STRIDE = SIZE + 1
 _BITS = np.array([1 << (y * _STRIDE + x) for y in range(SIZE) for x in range(SIZE)], dtype=object)
@@ -55,12 +58,9 @@ _BLOCK_CELLS = np.array(
 _BLOCK_BITS = [int(_BITS[cells].sum()) for cells in _BLOCK_CELLS]
 
 
-def _blocks_sparing(cell: int) -> NDArray[np.int64]:
-    """Indices of the 2 x 2 blocks that cover neither ``cell`` nor the goal."""
-    return np.flatnonzero(~np.isin(_BLOCK_CELLS, (cell, _GOAL_CELL)).any(axis=1))
-
-
-_BLOCKS_SPARING = [_blocks_sparing(cell) for cell in range(SIZE * SIZE)]
+# [cell, block]: whether the 2 x 2 block leaves the cell free; and the blocks that spare a cell and the center.
+_SPARES = np.array([np.not_equal(_BLOCK_CELLS, cell).all(axis=1) for cell in range(SIZE * SIZE)])
+_BLOCKS_SPARING = [np.flatnonzero(spares & _SPARES[_GOAL_CELL]) for spares in _SPARES]
 
 
 def _neighbors() -> NDArray[np.int64]:
@@ -87,12 +87,12 @@ def next_cells(obstacles: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 class Nav2DVectorEnv(BatchEnv):
-    """Navigate a 15 x 15 grid to its center; ``num_envs`` copies at once. ``Nav2DEnv`` is the batch of one.
+    """Navigate a 15 x 15 grid to its goal; ``num_envs`` copies at once. ``Nav2DEnv`` is the batch of one.
 
     **Observation**: ``Box(0, 255, (3, 15, 15), uint8)``; channels agent, obstacles, goal, each 255 where the thing is
     and 0 elsewhere, indexed ``[channel, y, x]``. **Action**: ``Discrete(4)``, the moves (dx, dy) = (0,-1), (0,1),
     (-1,0), (1,0), that is up, down, left, right; a move into an obstacle or off the grid leaves the agent in place.
-    **Reward**: -1 a step, 0 for the step that reaches the goal (7, 7), which ends the episode. **Truncation** after
+    **Reward**: -1 a step, 0 for the step that reaches the goal, which ends the episode. **Truncation** after
     50 steps. ``info["is_success"]`` is true where the goal was reached.
 
     **Start**, ``layout="random"`` (``Nav2D-v0``): agent uniform over all cells but the goal; 20 obstacles of 2 x 2
@@ -102,11 +102,20 @@ class Nav2DVectorEnv(BatchEnv):
     where they fall on cells that cannot be reached. The paper prints both structures as small figures only, so we
     chose their cells.
 
+    **Goal**: the center (7, 7). ``goal="random"`` (``Nav2DRandomGoal-v0``) samples it in each episode, uniformly over
+    all cells, or over the reachable ones of a fixed structure, and then agent and obstacles as above. ``"corners"``
+    samples it from (3, 3), (11, 3), (3, 11) and (11, 11), with random obstacles alone.
+
+    **Factors**: agent (x, y), int64 (2,); obstacles by [y, x], bool (15, 15); unless the goal is the center also goal
+    (x, y).
+
     :param num_envs: number of copies
     :param max_episode_steps: set by ``gymnasium.make_vec``
     :param render_mode: None or "rgb_array"
     :param autoreset: see :class:`BatchEnv`
     :param layout: "random", "corridor" or "maze"
+    :param goal: "center", "random" or "corners"
+    :raises ValueError: for another layout or goal, or corners in a fixed structure
     """
 
     def __init__(
@@ -116,7 +125,12 @@ class Nav2DVectorEnv(BatchEnv):
         render_mode: str | None = None,
         autoreset: bool = True,
         layout: str = "random",
+        goal: str = "center",
     ) -> None:
+        if goal not in ("center", "random", "corners"):
+            raise ValueError(f"goal must be 'center', 'random' or 'corners', got {goal!r}")
+        if goal == "corners" and layout != "random":
+            raise ValueError(f"goal='corners' may be blocked in layout={layout!r}; give goal='random'")
         if layout != "random" and layout not in LAYOUTS:
             raise ValueError(f"layout must be one of {['random', *LAYOUTS]}, got {layout!r}")
         super().__init__(
@@ -127,7 +141,7 @@ class Nav2DVectorEnv(BatchEnv):
             render_mode,
             autoreset,
         )
-        self.layout = layout
+        self.layout, self.goal = layout, goal
         # Observations are kept up to date move by move; channel order as in CHANNELS, cells flattened.
         self._observations = np.zeros((num_envs, len(CHANNELS), SIZE * SIZE), dtype=np.uint8)
         self._observations[:, 2, _GOAL_CELL] = 255
@@ -140,41 +154,54 @@ class Nav2DVectorEnv(BatchEnv):
         if layout != "random":
             cells = np.array([list(row) for row in LAYOUTS[layout]]).ravel()
             self._walls, self._scenery = cells == "#", cells == "?"
-            # The agent starts anywhere in the reachable region but on the goal.
-            self._starts = np.flatnonzero((cells == ".") & (np.arange(SIZE * SIZE) != _GOAL_CELL))
+            self._reachable = np.flatnonzero(cells == ".")
 
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         sample = self._sample_random if self.layout == "random" else self._sample_fixed
         for i in indices:
-            cell, obstacles = sample(self._generators[i])
+            cell, goal, obstacles = sample(self._generators[i])
             self._agents[i] = self._first[i] + cell
             self._observations[i, 0] = 0
             self._observations[i, 0, cell] = 255
             self._observations[i, 1] = np.where(obstacles, 255, 0)
+            if self.goal != "center":
+                self._observations[i, 2] = 0
+                self._observations[i, 2, goal] = 255
+                self._goals[i] = self._first[i] + goal
             self._targets[i, :_N_CELLS] = self._first[i] + next_cells(obstacles)
 
-    def _sample_random(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
-        """An agent's cell and obstacles (SIZE * SIZE,) with a path to the goal."""
+    def _sample_random(self, generator: np.random.Generator) -> tuple[int, int, NDArray[np.bool_]]:
+        """The cells of agent and goal, and obstacles (SIZE * SIZE,) that leave a path between them."""
         while True:
+            goal = self._sample_goal(generator, np.arange(SIZE * SIZE))
             cell = int(generator.integers(SIZE * SIZE - 1))
-            cell += cell >= _GOAL_CELL
-            allowed = _BLOCKS_SPARING[cell]
+            cell += cell >= goal
+            allowed = _BLOCKS_SPARING[cell] if goal == _GOAL_CELL else np.flatnonzero(_SPARES[cell] & _SPARES[goal])
             blocks = allowed[generator.integers(len(allowed), size=N_OBSTACLES)]
             board = 0
             for block in blocks:
                 board |= _BLOCK_BITS[block]
             start = _BITS[cell]
-            if flood_fill(_BITS[_GOAL_CELL], _BOARD & ~board, _STRIDE, stop=start) & start:
+            if flood_fill(_BITS[goal], _BOARD & ~board, _STRIDE, stop=start) & start:
                 obstacles = np.zeros(SIZE * SIZE, dtype=bool)
                 obstacles[_BLOCK_CELLS[blocks]] = True
-                return cell, obstacles
+                return cell, goal, obstacles
 
-    def _sample_fixed(self, generator: np.random.Generator) -> tuple[int, NDArray[np.bool_]]:
-        """An agent's cell in the fixed reachable region, and its walls with new scenery beyond them."""
-        cell = int(self._starts[generator.integers(len(self._starts))])
+    def _sample_goal(self, generator: np.random.Generator, cells: NDArray[np.int64]) -> int:
+        """The goal's cell: the center, without sampling, or one of the corners or of ``cells``."""
+        if self.goal == "center":
+            return _GOAL_CELL
+        return int(generator.choice(_CORNER_CELLS if self.goal == "corners" else cells))
+
+    def _sample_fixed(self, generator: np.random.Generator) -> tuple[int, int, NDArray[np.bool_]]:
+        """The cells of agent and goal in the fixed reachable region, and its walls with new scenery beyond them."""
+        goal = self._sample_goal(generator, self._reachable)
+        # The agent starts anywhere there but on the goal.
+        starts = self._reachable[self._reachable != goal]
+        cell = int(starts[generator.integers(len(starts))])
         scenery = np.zeros(SIZE * SIZE, dtype=bool)
         scenery[_BLOCK_CELLS[generator.integers(len(_BLOCK_CELLS), size=N_OBSTACLES)]] = True
-        return cell, self._walls | (scenery & self._scenery)
+        return cell, goal, self._walls | (scenery & self._scenery)
 
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         pixels = self._observations.reshape(-1)
@@ -189,10 +216,15 @@ class Nav2DVectorEnv(BatchEnv):
         return self._observations[indices].reshape(-1, len(CHANNELS), SIZE, SIZE)
 
     def factors(self) -> dict[str, NDArray[Any]]:
-        """Agent (x, y), int64 (num_envs, 2); obstacles by [y, x], bool (num_envs, 15, 15)."""
-        y, x = np.divmod(self._agents - self._first, SIZE)
+        """The simulator's state that the current observations show, for probes; see the class."""
         obstacles = self._observations[:, 1].reshape(-1, SIZE, SIZE) > 0
-        return {"agent": np.stack([x, y], axis=1), "obstacles": obstacles}
+        factors = {"agent": self._positions(self._agents), "obstacles": obstacles}
+        return factors | ({} if self.goal == "center" else {"goal": self._positions(self._goals)})
+
+    def _positions(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The (x, y) of one cell in each copy, shape (num_envs, 2)."""
+        y, x = np.divmod(indices - self._first, SIZE)
+        return np.stack([x, y], axis=1)
 
     def _render_frame(self, index: int) -> NDArray[np.uint8]:
         agent, obstacles, goal = self._observations[index].reshape(-1, SIZE, SIZE) > 0

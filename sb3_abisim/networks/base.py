@@ -202,6 +202,15 @@ def default_network(shape: tuple[int, ...]) -> str:
             f"observations of shape {shape} have their channels last, encoders take them first; wrap the environment "
             "in Stable-Baselines3's VecTransposeImage, or name a network"
         )
+    return generic_network(shape)
+
+
+def generic_network(shape: tuple[int, ...]) -> str:
+    """The network for any number of channels and any size.
+
+    :param shape: (channels, height, width)
+    :return: "nature", or "small" for images under 36 pixels
+    """
     return "nature" if min(shape[1:]) >= NATURE_SIZE else "small"
 
 

@@ -110,7 +110,7 @@ def _preprocessing(venv: VecEnv) -> tuple[list[str], list[str] | None]:
     return layers, wrappers
 
 
-def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> None:
+def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any], unfreezes: bool = False) -> None:
     """Refuse a model whose extractors are not those that ``policy_kwargs`` would build.
 
     An encoder file that is not there is taken for the model's: a saved model is complete without it. A custom extractor
@@ -118,6 +118,7 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
 
     :param model: an SB3 model
     :param policy_kwargs: as for a new model
+    :param unfreezes: whether a frozen encoder is unfrozen at some step, so that the model may be on either side of it
     :raises ValueError: with both sides
     """
     asked_class = policy_kwargs.get("features_extractor_class")
@@ -129,10 +130,14 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any]) -> N
         each_class = EncoderExtractor if issubclass(asked_class, CombinedEncoderExtractor) else asked_class
         hashes = [_hash_of(encoder, network) for encoder, network in encoders_of(asked_class, kwargs)] or [None]
         absent = None in hashes and issubclass(each_class, PretrainedExtractor)
-        frozen = bool(kwargs.get("freeze", False))
-        here = {_name(each_class, frozen, None if absent else hash) for hash in hashes}
+        frozen = bool(kwargs.get("freeze", False)) and not unfreezes
+        extras = each_class.asked_extras(kwargs)
+        here = {_name(each_class, frozen, None if absent else hash, extras) for hash in hashes}
     extractors = [extractor for _, extractor in find_extractors(model.policy)]
-    there = {_name(type(each), each.frozen, None if absent else each.hash) for each in extractors}
+    there = {
+        _name(type(each), each.frozen and not unfreezes, None if absent else each.hash, each.extras)
+        for each in extractors
+    }
     if there != here:
         sides = (" and ".join(sorted(side)) or "none of our extractors" for side in (there, here))
         raise ValueError("it was trained with {}, not with {}".format(*sides))
@@ -145,5 +150,5 @@ def _hash_of(encoder: str, network: str | None) -> str | None:
         return None
 
 
-def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None) -> str:
-    return extractor.__name__ + f", hash {hash}" * (hash is not None) + ", frozen" * frozen
+def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None, extras: str) -> str:
+    return extractor.__name__ + f", hash {hash}" * (hash is not None) + ", frozen" * frozen + extras

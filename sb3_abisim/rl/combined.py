@@ -11,6 +11,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from torch import nn
 
 from sb3_abisim.networks.base import NATURE_SIZE
+from sb3_abisim.rl.augment import Augment
 from sb3_abisim.rl.extractors import EncoderExtractor
 
 
@@ -25,6 +26,10 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
         file. :func:`~sb3_abisim.rl.policy_kwargs.policy_kwargs` fills it in: saved models then load without the files
     :param nature_cnn: whether images without an encoder get SB3's untrained ``NatureCNN``
     :param cnn_output_dim: size of its output, as in SB3
+    :param task_features_dim: of each image with an encoder, as for an extractor of one image; their outputs stand
+        behind the embedding of the image
+    :param augment: of all images, as for an extractor of one image
+    :param augment_kwargs: its keyword arguments
     :raises ValueError: for a space that is no dictionary, an encoder for what is no image, or an image without encoder
     """
 
@@ -36,6 +41,9 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
         networks: Mapping[str, Mapping[str, Any]] | None = None,
         nature_cnn: bool = False,
         cnn_output_dim: int = 256,
+        task_features_dim: int = 0,
+        augment: str | None = None,
+        augment_kwargs: dict[str, Any] | None = None,
     ) -> None:
         if not isinstance(observation_space, spaces.Dict):
             raise ValueError(f"observations must be a dictionary, got {observation_space}; use EncoderExtractor")
@@ -57,7 +65,15 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
         for key, space in observation_space.spaces.items():
             extractor: BaseFeaturesExtractor | None = None
             if key in encoders:
-                extractor = EncoderExtractor(space, encoders[key], freeze, **(networks or {}).get(key, {}))
+                extractor = EncoderExtractor(
+                    space,
+                    encoders[key],
+                    freeze,
+                    **(networks or {}).get(key, {}),
+                    task_features_dim=task_features_dim,
+                    augment=augment,
+                    augment_kwargs=augment_kwargs,
+                )
             elif key in without:
                 if min((space.shape or ())[1:]) < NATURE_SIZE:
                     raise ValueError(
@@ -66,6 +82,8 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
                     )
                 extractor = NatureCNN(space, features_dim=cnn_output_dim)
             extractors[key] = nn.Flatten() if extractor is None else extractor
+            if augment is not None and key in without:
+                extractors[key] = nn.Sequential(Augment(space, augment, augment_kwargs), extractors[key])
             features_dim += get_flattened_obs_dim(space) if extractor is None else extractor.features_dim
         super().__init__(observation_space, features_dim)
         self.extractors = nn.ModuleDict(extractors)

@@ -58,7 +58,7 @@ def _class_of(method: Method) -> type[BaseEncoderExtractor]:
     parent: type[BaseEncoderExtractor] = PretrainedExtractor if method.has_encoder_file else VanillaExtractor
     if method.extractor == parent.__name__:
         return parent
-    attributes: dict[str, Any] = {"__module__": extractors.__name__}
+    attributes: dict[str, Any] = {"__module__": extractors.__name__, "default_augment": method.augment}
     summary = f"The network without pretraining, for the method ``{method.name}``"
     if method.has_encoder_file:
         attributes["objective"] = method.name

@@ -5,7 +5,8 @@ name, such as ``SSIExtractor``.
 
 What SB3 does to any extractor with its default settings, and where that is stopped here:
 
-* ``ortho_init`` draws the weights of every submodule anew: :meth:`PretrainedExtractor.apply`.
+* ``ortho_init`` draws the weights of every submodule anew: :meth:`PretrainedExtractor.apply`, which lets it do so to
+  task features alone.
 * ``set_training_mode(True)`` wakes batch norm: :meth:`PretrainedExtractor.train`.
 * Target networks are averaged over ``parameters()``, which rounds even where both sides are equal, and optimizers with
   weight decay move what has no gradient: frozen weights are buffers, not parameters.
@@ -15,6 +16,7 @@ What SB3 does to any extractor with its default settings, and where that is stop
 
 import math
 import warnings
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -27,17 +29,30 @@ from torch import nn
 from sb3_abisim.common.images import ImageCheck
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
+from sb3_abisim.rl.augment import Augment
 from sb3_abisim.rl.file_network import build_network, check_objective, read_network
 from sb3_abisim.rl.frozen_weights import buffers_to_parameters, parameters_to_buffers
-from sb3_abisim.rl.optimizers import mark_encoder
+from sb3_abisim.rl.task_features import make_task_network
 
 
 class BaseEncoderExtractor(BaseFeaturesExtractor):
     """Hands an encoder's embedding, as it is, to the policy. Base of all extractors of one image here.
 
+    What is said of weights (``n_parameters``, ``initial_weights``, :meth:`relative_weight_change`) is said of the
+    encoder's alone.
+
     :param observation_space: uint8 images in 0..255, channels first (SB3 transposes the others by itself)
     :param encoder: the network
+    :param task_features_dim: size of a small network's output that is appended to the embedding; RL trains it from
+        scratch, whether the encoder is frozen or not. 0 for none (:mod:`sb3_abisim.rl.task_features`)
+    :param augment: what observations are augmented by while they are learned from: "random_shift" (DrQ),
+        "random_crop", "color_jitter", another registered name or ``pkg.module:Function``
+        (:mod:`sb3_abisim.rl.augment`)
+    :param augment_kwargs: its keyword arguments
     """
+
+    # Of the method; `augment` names another one.
+    default_augment: ClassVar[str | None] = None
 
     # The weights that training started from, flat, float32; a buffer, so that it is saved with the model.
     initial_weights: th.Tensor
@@ -45,19 +60,28 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
     source: str
     frozen: bool = False
 
-    def __init__(self, observation_space: gym.Space[Any], encoder: Encoder) -> None:
-        super().__init__(observation_space, encoder.features_dim)
+    def __init__(
+        self,
+        observation_space: gym.Space[Any],
+        encoder: Encoder,
+        task_features_dim: int = 0,
+        augment: str | None = None,
+        augment_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        task_features = make_task_network(observation_space, task_features_dim)
+        super().__init__(observation_space, encoder.features_dim + task_features_dim)
         self.encoder = encoder
-        mark_encoder(encoder)
+        self.task_features, self.task_features_dim = task_features, task_features_dim
+        augment = augment or self.default_augment
+        if augment is None and augment_kwargs:
+            raise ValueError(
+                f"augment_kwargs={augment_kwargs} belong to no augmentation; give augment=, or leave them out"
+            )
+        self.augment = None if augment is None else Augment(observation_space, augment, augment_kwargs)
         self._weight_names = [name for name, _ in encoder.named_parameters()]
         self.register_buffer("initial_weights", self._flat_weights().clone())
         self._input_checked = False
         self._image_check = ImageCheck()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)  # type: ignore[no-untyped-call]
-        # Copies of parameters lose it.
-        mark_encoder(self.encoder)
 
     @property
     def hash(self) -> str | None:
@@ -79,7 +103,7 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
         """Embed observations.
 
         :param observations: float (batch, channels, height, width) in 0..1, as SB3 preprocesses images
-        :return: the encoder's embedding, float (batch, features_dim)
+        :return: the encoder's embedding, and behind it the task features, float (batch, features_dim)
         :raises ValueError: if observations are not in 0..1 or embeddings not finite
         """
         # Numbers are not known then.
@@ -89,7 +113,11 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
         # Agents act without gradients. What they have seen is of the space's dtype when it is learned from.
         if knows_numbers and not (self._input_checked and th.is_grad_enabled()):
             self._require_range(observations)
+        if self.augment is not None:
+            observations = self.augment(observations)
         features: th.Tensor = self.encoder(observations)
+        if self.task_features is not None:
+            features = th.cat([features, self.task_features(observations)], dim=1)
         # One sum shows whether a number is not finite.
         if knows_numbers and not math.isfinite(float(features.detach().sum())):
             self._require_range(observations)
@@ -99,6 +127,21 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
                     "weights are, or are far too large; lower the learning rate, or look for NaN in rewards"
                 )
         return features
+
+    @property
+    def extras(self) -> str:
+        """What it does beside embedding, for messages; empty for nothing."""
+        name, kwargs = (None, None) if self.augment is None else (self.augment.name, self.augment.kwargs)
+        return describe_extras(self.task_features_dim, name, kwargs)
+
+    @classmethod
+    def asked_extras(cls, kwargs: Mapping[str, Any]) -> str:
+        """:attr:`extras` of an extractor that is not there yet.
+
+        :param kwargs: its arguments
+        """
+        augment = kwargs.get("augment") or cls.default_augment
+        return describe_extras(kwargs.get("task_features_dim", 0), augment, kwargs.get("augment_kwargs"))
 
     @property
     def _label(self) -> str:
@@ -139,6 +182,9 @@ class VanillaExtractor(BaseEncoderExtractor):
     :param observation_space: uint8 images in 0..255, channels first
     :param network: name of the network; None takes the one made for the observation's shape
     :param network_kwargs: its keyword arguments
+    :param task_features_dim: see :class:`BaseEncoderExtractor`
+    :param augment: see :class:`BaseEncoderExtractor`
+    :param augment_kwargs: see :class:`BaseEncoderExtractor`
     :raises ValueError: for an observation space that is not of images or does not fit the network
     """
 
@@ -149,9 +195,13 @@ class VanillaExtractor(BaseEncoderExtractor):
         observation_space: gym.Space[Any],
         network: str | None = None,
         network_kwargs: dict[str, Any] | None = None,
+        task_features_dim: int = 0,
+        augment: str | None = None,
+        augment_kwargs: dict[str, Any] | None = None,
     ) -> None:
         _check_space(observation_space)
-        super().__init__(observation_space, make_encoder(observation_space, network, **(network_kwargs or {})))
+        encoder = make_encoder(observation_space, network, **(network_kwargs or {}))
+        super().__init__(observation_space, encoder, task_features_dim, augment, augment_kwargs)
 
     def apply(self, fn: Any) -> "VanillaExtractor":
         """As in torch; SB3 initializes through this method, so the weight change is measured from the new weights.
@@ -177,6 +227,9 @@ class PretrainedExtractor(BaseEncoderExtractor):
     :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
     :param network: name of the network; None takes the one made for the observation's shape
     :param network_kwargs: its keyword arguments
+    :param task_features_dim: see :class:`BaseEncoderExtractor`
+    :param augment: see :class:`BaseEncoderExtractor`
+    :param augment_kwargs: see :class:`BaseEncoderExtractor`
     :raises ValueError: for a damaged file, or one of another objective, other observations or another network
     """
 
@@ -194,6 +247,9 @@ class PretrainedExtractor(BaseEncoderExtractor):
         freeze: bool = False,
         network: str | None = None,
         network_kwargs: dict[str, Any] | None = None,
+        task_features_dim: int = 0,
+        augment: str | None = None,
+        augment_kwargs: dict[str, Any] | None = None,
     ) -> None:
         _check_space(observation_space)
         file: EncoderFile | None = None
@@ -209,7 +265,7 @@ class PretrainedExtractor(BaseEncoderExtractor):
                 network, network_kwargs = read_network(file, network, network_kwargs)
             file.check(observation_space)
         module = build_network(observation_space, network, network_kwargs or {}, file)
-        super().__init__(observation_space, module)
+        super().__init__(observation_space, module, task_features_dim, augment, augment_kwargs)
         self.source = encoder
         self.frozen = freeze
         self.metadata = None if file is None else file.metadata
@@ -237,10 +293,12 @@ class PretrainedExtractor(BaseEncoderExtractor):
             raise EncoderNotFoundError(f"{self._absence}. The extractor has no pretrained weights")
 
     def apply(self, fn: Any) -> "PretrainedExtractor":
-        """Do nothing: SB3's ``ortho_init=True`` would overwrite the pretrained weights through this method.
+        """Reach task features alone: SB3's ``ortho_init=True`` would overwrite the pretrained weights through here.
 
-        :param fn: not called
+        :param fn: called on the submodules of ``task_features``, if there are some
         """
+        if self.task_features is not None:
+            self.task_features.apply(fn)
         return self
 
     def train(self, mode: bool = True) -> "PretrainedExtractor":
@@ -269,7 +327,6 @@ class PretrainedExtractor(BaseEncoderExtractor):
             return []
         parameters = buffers_to_parameters(self.encoder, self._weight_names)
         self.frozen = False
-        mark_encoder(self.encoder)
         self.encoder.train(self.training)
         return parameters
 
@@ -301,8 +358,22 @@ class EncoderExtractor(PretrainedExtractor):
     :param network: name of the network; None reads it from the file, unless that is a ``pkg.module:Factory``, which is
         imported only if you name it
     :param network_kwargs: its keyword arguments; None reads them from the file
+    :param task_features_dim: see :class:`BaseEncoderExtractor`
+    :param augment: see :class:`BaseEncoderExtractor`
+    :param augment_kwargs: see :class:`BaseEncoderExtractor`
     :raises ValueError: for a damaged file, or one of other observations or another network
     """
+
+
+def describe_extras(task_features_dim: int, augment: str | None, augment_kwargs: Mapping[str, Any] | None) -> str:
+    """What an extractor does beside embedding, in words; empty for nothing.
+
+    :param task_features_dim: as of an extractor
+    :param augment: as of an extractor
+    :param augment_kwargs: as of an extractor
+    """
+    task = f", task_features_dim={task_features_dim}" * bool(task_features_dim)
+    return task + f", augment={augment}" * bool(augment) + f" {dict(augment_kwargs or {})}" * bool(augment_kwargs)
 
 
 def _check_space(observation_space: gym.Space[Any]) -> None:

@@ -1,77 +1,128 @@
-"""An optimizer that gives a fine-tuned encoder its own learning rate.
+"""A learning rate of its own for some of an optimizer's parameters, whatever the optimizer's class.
 
-Stable-Baselines3 writes one learning rate into every parameter group at each ``train()``, so rates of single groups do
-not last. Here each group keeps a factor, which is applied within ``step``.
+Stable-Baselines3 writes one learning rate into every parameter group at each ``train()``, and it loads an optimizer's
+state only into the groups that it builds by itself. So an optimizer keeps its groups, and is given others while it
+steps: those of :class:`OwnRate`, with the parameters that have another rate in a group of their own. Averages and
+momenta belong to parameters, not to groups, and stay where they are. A saved model is one of plain Stable-Baselines3.
 """
 
-import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch as th
+from stable_baselines3.td3.policies import TD3Policy
 from torch import nn
 
-_MARK = "sb3_abisim_encoder"
+# A group and the part of it that is stepped with.
+_Pairs = list[tuple[dict[str, Any], dict[str, Any]]]
+# What a part has of its own.
+_OURS = ("params", "lr")
 
 
-def mark_encoder(encoder: nn.Module) -> None:
-    """Tell optimizers built later that these are an encoder's parameters; the extractors call it.
+def policy_optimizers(policy: Any) -> list[tuple[Any, list[nn.Parameter]]]:
+    """The modules of a policy that own an optimizer, each with the parameters that SB3 builds it for.
 
-    :param encoder: the network
+    :param policy: ``model.policy``
     """
-    for parameter in encoder.parameters():
-        setattr(parameter, _MARK, True)
+    found: list[tuple[Any, list[nn.Parameter]]] = []
+    actor, critic = getattr(policy, "actor", None), getattr(policy, "critic", None)
+    owner: Any
+    for owner in (policy, actor, critic):
+        if getattr(owner, "optimizer", None) is None:
+            continue
+        # Value-based policies optimize one of their two networks.
+        network = getattr(policy, "q_net", None) or getattr(policy, "quantile_net", None) or owner
+        named = network.named_parameters()
+        # A shared extractor is the actor's, except in TD3, which gives it to both optimizers.
+        if owner is critic and policy.share_features_extractor and not isinstance(policy, TD3Policy):
+            named = ((name, parameter) for name, parameter in named if "features_extractor" not in name)
+        found.append((owner, [parameter for _, parameter in named]))
+    return found
 
 
-class EncoderLRAdam(th.optim.Adam):
-    """Adam whose learning rate for the encoder is a multiple of that for all else.
+class OwnRate:
+    """While an optimizer steps, some of its parameters have another learning rate.
 
-    In ``policy_kwargs``: ``optimizer_class=EncoderLRAdam, optimizer_kwargs={"encoder_lr_factor": 0.1, "eps": 1e-5}``.
-    Stable-Baselines3 sets ``eps=1e-5`` for PPO and A2C only while ``optimizer_kwargs`` is left out, so a run that is to
-    differ in nothing else has to name it there.
-
-    The factor is saved with the optimizer's state; like Adam's other settings it then comes from the saved model.
-
-    :param params: parameters, those of an encoder marked by their features extractor
-    :param lr: learning rate of all that is not the encoder
-    :param encoder_lr_factor: the encoder's learning rate divided by ``lr``, above 0
-    :param kwargs: passed to ``torch.optim.Adam``
-    :raises ValueError: for a factor that is not above 0, or if no parameter is an encoder's: the extractor is not one
-        of this package, it is frozen, or it is shared with the actor, whose optimizer alone then trains it
+    :param optimizer: of any class of ``torch.optim.Optimizer`` that keeps nothing but settings in its groups
+    :param parameters: those that have it; others that the optimizer does not hold are left alone
+    :param rate: makes it of the learning rate of all else; called before each step
+    :raises ValueError: in the first step, for an optimizer that changes other things of its groups
     """
 
     def __init__(
-        self, params: Iterable[th.Tensor], lr: float = 1e-3, encoder_lr_factor: float = 1.0, **kwargs: Any
+        self, optimizer: th.optim.Optimizer, parameters: Iterable[nn.Parameter], rate: Callable[[float], float]
     ) -> None:
-        if not (encoder_lr_factor > 0 and math.isfinite(encoder_lr_factor)):
-            raise ValueError(
-                f"encoder_lr_factor must be a number above 0, got {encoder_lr_factor}; to keep the encoder as it is, "
-                "give freeze=True in features_extractor_kwargs"
-            )
-        params = list(params)
-        encoder = [parameter for parameter in params if hasattr(parameter, _MARK)]
-        rest = [parameter for parameter in params if not hasattr(parameter, _MARK)]
-        if not encoder:
-            raise ValueError(
-                f"encoder_lr_factor={encoder_lr_factor}, but none of {len(params)} parameters is an encoder's; use a "
-                "features extractor of sb3_abisim with freeze=False (and share_features_extractor=False in SAC and "
-                "TQC), or remove optimizer_class and encoder_lr_factor from policy_kwargs"
-            )
-        groups = [{"params": rest, "lr_factor": 1.0}, {"params": encoder, "lr_factor": encoder_lr_factor}]
-        super().__init__(groups, lr=lr, **kwargs)
+        self.optimizer = optimizer
+        self._ids = {id(parameter) for parameter in parameters}
+        self._rate = rate
+        self._pairs: _Pairs = []
+        self._groups: list[dict[str, Any]] | None = None
+        self._depth = 0
+        self._hooks = [
+            optimizer.register_step_pre_hook(self._before),
+            optimizer.register_step_post_hook(self._after),
+        ]
 
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """One step of Adam, with the encoder's learning rate for the encoder.
+    def remove(self) -> None:
+        """Leave the optimizer as it was, also after a step that has failed."""
+        for hook in self._hooks:
+            hook.remove()
+        if self._groups is not None:
+            self.optimizer.param_groups = self._groups
+        self._groups, self._depth = None, 0
 
-        :param closure: computes the loss anew, as in torch
-        :return: the loss, if there is a closure
-        """
-        rates = [group["lr"] for group in self.param_groups]
-        for group in self.param_groups:
-            group["lr"] = group["lr"] * group["lr_factor"]
-        try:
-            loss: float | None = super().step(closure)
-            return loss
-        finally:
-            for group, rate in zip(self.param_groups, rates, strict=True):
-                group["lr"] = rate
+    def _before(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
+        # A class whose step calls that of its parent runs the hooks twice, one pair within the other.
+        self._depth += 1
+        if self._depth > 1:
+            return
+        self._groups = optimizer.param_groups
+        self._pairs = [(group, part) for group in self._groups for part in self._split(group)]
+        optimizer.param_groups = [part for _, part in self._pairs]
+
+    def _after(self, optimizer: th.optim.Optimizer, *_: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0 and self._groups is not None:
+            optimizer.param_groups, self._groups = self._groups, None
+            _require_settings_alone(optimizer, self._pairs)
+
+    def _split(self, group: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        ours = [parameter for parameter in group["params"] if id(parameter) in self._ids]
+        rest = [parameter for parameter in group["params"] if id(parameter) not in self._ids]
+        if rest:
+            yield {**group, "params": rest}
+        if ours:
+            yield {**group, "params": ours, "lr": self._rate(group["lr"])}
+
+
+@contextmanager
+def only(optimizer: th.optim.Optimizer, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
+    """Let an optimizer hold nothing but some of its parameters for a while.
+
+    :param optimizer: as for :class:`OwnRate`
+    :param parameters: those that it keeps
+    :raises ValueError: as :class:`OwnRate`
+    """
+    ids = {id(parameter) for parameter in parameters}
+    groups = optimizer.param_groups
+    pairs = [(group, {**group, "params": [p for p in group["params"] if id(p) in ids]}) for group in groups]
+    optimizer.param_groups = [part for _, part in pairs if part["params"]]
+    try:
+        yield
+    finally:
+        optimizer.param_groups = groups
+    _require_settings_alone(optimizer, pairs)
+
+
+def _require_settings_alone(optimizer: th.optim.Optimizer, pairs: _Pairs) -> None:
+    """Refuse an optimizer that counts or adapts in its groups: it would have done so in a copy."""
+    changed = sorted(
+        {key for group, part in pairs for key in part if key not in _OURS and part[key] is not group.get(key, part)}
+    )
+    if changed:
+        raise ValueError(
+            f"{type(optimizer).__name__} changes {', '.join(changed)} of its parameter groups in each step, so no "
+            "parameter can have a learning rate or a loss of its own; choose another optimizer_class, or remove "
+            "encoder_lr, encoder_lr_factor and encoder_trained_by"
+        )

@@ -13,7 +13,12 @@ _File = str | os.PathLike[str]
 
 
 def policy_kwargs(
-    encoder: _File | Mapping[str, _File], freeze: bool = False, *, network: str | None = None, **more: Any
+    encoder: _File | Mapping[str, _File],
+    freeze: bool = False,
+    *,
+    network: str | None = None,
+    extractor_kwargs: Mapping[str, Any] | None = None,
+    **more: Any,
 ) -> dict[str, Any]:
     """``policy_kwargs`` for an encoder file; a new dictionary at every call, since SB3 writes into it.
 
@@ -24,6 +29,7 @@ def policy_kwargs(
         of image keys to such files
     :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
     :param network: ``pkg.module:Factory``, for a file that names a network of yours, which is imported
+    :param extractor_kwargs: further arguments of the features extractor: ``task_features_dim``, ``augment``
     :param more: further entries, such as ``net_arch``
     :raises FileNotFoundError: if there is no such encoder
     :raises ValueError: for a damaged file, or an entry that this function sets
@@ -31,7 +37,8 @@ def policy_kwargs(
     taken = sorted(name for name in more if name.startswith("features_extractor_"))
     if taken:
         raise ValueError(
-            f"policy_kwargs sets {', '.join(taken)} from the file; leave it out, or write the dict by hand"
+            f"policy_kwargs sets {', '.join(taken)} from the file; leave it out (further arguments of the extractor "
+            "are extractor_kwargs), or write the dict by hand"
         )
     extractor: type = EncoderExtractor
     kwargs: dict[str, Any]
@@ -43,4 +50,8 @@ def policy_kwargs(
         }
     else:
         kwargs = {"encoder": os.fspath(encoder), **stored_network(load_encoder(encoder, network))}
-    return {"features_extractor_class": extractor, "features_extractor_kwargs": {**kwargs, "freeze": freeze}, **more}
+    return {
+        "features_extractor_class": extractor,
+        "features_extractor_kwargs": {**kwargs, "freeze": freeze, **(extractor_kwargs or {})},
+        **more,
+    }

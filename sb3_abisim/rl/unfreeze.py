@@ -5,10 +5,9 @@ from typing import Any
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.td3.policies import TD3Policy
-from torch import nn
 
 from sb3_abisim.rl.extractors import PretrainedExtractor
+from sb3_abisim.rl.optimizers import policy_optimizers
 
 
 def unfreeze_encoder(model: BaseAlgorithm) -> None:
@@ -18,21 +17,14 @@ def unfreeze_encoder(model: BaseAlgorithm) -> None:
     can be saved and loaded; what they know of all other parameters (Adam's averages) stays.
 
     :param model: any algorithm of Stable-Baselines3 or sb3-contrib that holds frozen encoders
-    :raises ValueError: if it holds none
+    :raises ValueError: as :func:`require_unfreezable`
     """
     policy: Any = model.policy
-    frozen = [module for module in policy.modules() if isinstance(module, PretrainedExtractor) and module.frozen]
-    if not frozen:
-        raise ValueError("the model holds no frozen encoder; make one with freeze=True, or use it as it is")
+    frozen = require_unfreezable(model)
     kwargs = copy.deepcopy(model.policy_kwargs)
-    arguments = kwargs.get("features_extractor_kwargs") or {}
-    if not arguments.get("freeze"):
-        raise ValueError(
-            f"features_extractor_kwargs of the model hold no freeze=True, but {arguments}: it could not be loaded "
-            "again; let the custom features extractor take freeze as an argument"
-        )
+    arguments = kwargs["features_extractor_kwargs"]
     new = {id(parameter) for extractor in frozen for parameter in extractor.unfreeze()}
-    for owner, parameters in _optimizers(policy):
+    for owner, parameters in policy_optimizers(policy):
         if any(id(parameter) in new for parameter in parameters):
             old: th.optim.Optimizer = owner.optimizer
             rate = old.param_groups[0]["lr"]
@@ -44,19 +36,19 @@ def unfreeze_encoder(model: BaseAlgorithm) -> None:
     policy.features_extractor_kwargs = arguments
 
 
-def _optimizers(policy: Any) -> list[tuple[Any, list[nn.Parameter]]]:
-    """The modules that own an optimizer, each with the parameters that SB3 builds it for."""
-    found: list[tuple[Any, list[nn.Parameter]]] = []
-    actor, critic = getattr(policy, "actor", None), getattr(policy, "critic", None)
-    owner: Any
-    for owner in (policy, actor, critic):
-        if getattr(owner, "optimizer", None) is None:
-            continue
-        # Value-based policies optimize one of their two networks.
-        network = getattr(policy, "q_net", None) or getattr(policy, "quantile_net", None) or owner
-        named = network.named_parameters()
-        # A shared extractor is the actor's, except in TD3, which gives it to both optimizers.
-        if owner is critic and policy.share_features_extractor and not isinstance(policy, TD3Policy):
-            named = ((name, parameter) for name, parameter in named if "features_extractor" not in name)
-        found.append((owner, [parameter for _, parameter in named]))
-    return found
+def require_unfreezable(model: BaseAlgorithm) -> list[PretrainedExtractor]:
+    """The frozen encoders of a model that :func:`unfreeze_encoder` can unfreeze, those of target networks included.
+
+    :param model: any algorithm
+    :raises ValueError: if it holds none, or none that a saved model could be built with again
+    """
+    frozen = [m for m in model.policy.modules() if isinstance(m, PretrainedExtractor) and m.frozen]
+    if not frozen:
+        raise ValueError("the model holds no frozen encoder; make one with freeze=True, or use it as it is")
+    arguments = model.policy_kwargs.get("features_extractor_kwargs") or {}
+    if not arguments.get("freeze"):
+        raise ValueError(
+            f"features_extractor_kwargs of the model hold no freeze=True, but {arguments}: it could not be loaded "
+            "again; let the custom features extractor take freeze as an argument"
+        )
+    return frozen

@@ -8,8 +8,8 @@ For the environments of this package:
 
 For every environment:
 
-* ``--conf-file METHOD[=ENCODER][,frozen]`` keeps the hyperparameters and replaces the features extractor; frozen, it
-  puts ``VecEncodeObservations`` in its place;
+* ``--conf-file METHOD[=ENCODER][,frozen][,option=value]`` keeps the hyperparameters and replaces the features
+  extractor; frozen and without options, it puts ``VecEncodeObservations`` in its place;
 * ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
 * a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
@@ -37,6 +37,7 @@ from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
 from sb3_abisim.registry import get_traits
+from sb3_abisim.rl.callbacks import EncoderCallback
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
 from sb3_abisim.zoo.methods import (
@@ -47,6 +48,7 @@ from sb3_abisim.zoo.methods import (
     hyperparameters_file,
     policy_of,
     resolve_classes,
+    unfreezes,
     zoo_hyperparams,
 )
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
@@ -66,6 +68,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     """``rl_zoo3.exp_manager.ExperimentManager`` that knows methods; parameters as there."""
 
     algo: str
+    callbacks: list[Any]
     config: str
     custom_hyperparams: dict[str, Any] | None
     env_kwargs: dict[str, Any]
@@ -229,14 +232,21 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 # A saved model is complete without it.
                 if not self.continue_training:
                     raise
-        frozen = bool(kwargs.get("freeze", False))
-        return MethodRecord(method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing)
+        frozen = bool(kwargs.get("freeze", False)) and not unfreezes(self._used)
+        options = {name: kwargs[name] for name in ("task_features_dim", "augment") if kwargs.get(name)}
+        return MethodRecord(
+            method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing, **options
+        )
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """As rl-zoo3 does.
+        """As rl-zoo3 does, once the encoder's callback agrees.
 
         :param model: to train
+        :raises ValueError: for a model that its arguments are not for
         """
+        for callback in self.callbacks:
+            if isinstance(callback, EncoderCallback):
+                callback.check(model)
         MethodExperimentManager.has_begun = True
         super().learn(model)
 
@@ -260,7 +270,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         asked = hyperparams.get("policy_kwargs") or {}
         model: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
         try:
-            check_trained_with(model, asked)
+            check_trained_with(model, asked, unfreezes(self._used))
         except ValueError as error:
             env.close()
             raise ValueError(f"cannot continue {self.trained_agent}: {error}; give the same --conf-file") from error

@@ -4,7 +4,7 @@ import importlib
 import importlib.util
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.yaml_text import read_yaml_file
 from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
-from sb3_abisim.registry import get_method, methods
+from sb3_abisim.registry import get_augmentation, get_method, methods
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
 from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_stack_of, items
@@ -22,13 +22,16 @@ ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
 ENCODER_CALLBACK = "sb3_abisim.EncoderCallback"
 # Beside config.yml in a run's folder.
 RECORD_NAME = "method.json"
+# What may stand after a method as ",name=value", in this order, and the type of the value.
+_OPTIONS: dict[str, Callable[[str], Any]] = {"task_features_dim": int, "augment": str}
 # Of policy_kwargs: what a YAML names by its dotted path.
 _CLASS_KEYS = ("features_extractor_class", "optimizer_class", "activation_fn")
 
 
 def grammar() -> str:
     """How a method spec is written, for messages."""
-    return f"METHOD[=ENCODER][,frozen] with METHOD one of {', '.join(methods())}"
+    options = "".join(f"[,{name}=VALUE]" for name in _OPTIONS)
+    return f"METHOD[=ENCODER][,frozen]{options} with METHOD one of {', '.join(methods())}"
 
 
 @dataclass(frozen=True)
@@ -39,18 +42,26 @@ class MethodSpec:
     :param encoder: a file, a shipped encoder's name or ``hf://owner/repository/file``; None for the shipped encoder of
         this method and the environment
     :param frozen: whether the weights stay as they are during RL
+    :param task_features_dim: size of the trainable network beside the encoder, 0 for none
+    :param augment: name of an augmentation; None for that of the method
     :raises ValueError: for an unknown method, or an encoder or ``frozen`` for an untrained one
     """
 
     name: str
     encoder: str | None = None
     frozen: bool = False
+    task_features_dim: int = 0
+    augment: str | None = None
 
     def __post_init__(self) -> None:
         if self.name not in methods():
             raise ValueError(f"unknown method {self.name!r}; give {grammar()}")
         if self.encoder == "":
             raise ValueError(f"no encoder after '{self.name}='; give {grammar()}")
+        if self.task_features_dim < 0:
+            raise ValueError(f"task_features_dim must be at least 0, got {self.task_features_dim}; give {grammar()}")
+        if self.augment is not None:
+            get_augmentation(self.augment)
         if not get_method(self.name).has_encoder_file and (self.encoder is not None or self.frozen):
             raise ValueError(
                 f"{self.name!r} trains its network from scratch: it takes neither an encoder nor ',frozen'"
@@ -58,13 +69,38 @@ class MethodSpec:
 
     @classmethod
     def parse(cls, text: str) -> "MethodSpec":
-        """Read ``METHOD[=ENCODER][,frozen]``.
+        """Read ``METHOD[=ENCODER][,frozen][,option=value]``, in any order of what follows a comma.
 
-        :param text: e.g. "ssi", "abisim,frozen" or "abisim=runs/mine.safetensors"
+        :param text: e.g. "ssi", "abisim,frozen,task_features_dim=64" or "abisim=runs/mine.safetensors"
         :raises ValueError: for anything else
         """
-        head, equals, encoder = text.removesuffix(",frozen").partition("=")
-        return cls(head, encoder if equals else None, frozen=text.endswith(",frozen"))
+        rest, given = text, dict[str, Any]()
+        # From the end: a path may hold commas and equals signs.
+        while match := re.fullmatch(rf"(.*),(?:(frozen)|({'|'.join(_OPTIONS)})=([^,]*))", rest):
+            rest, frozen, option, value = match.groups()
+            if (frozen or option) in given:
+                raise ValueError(f"{text!r} says {frozen or option} twice; give {grammar()}")
+            try:
+                given[frozen or option] = True if frozen else _OPTIONS[option](value)
+            except ValueError as error:
+                raise ValueError(f"{option} takes no {value!r} in {text!r}; give {grammar()}") from error
+        head, equals, encoder = rest.partition("=")
+        return cls(head, encoder if equals else None, **given)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What it says beyond method, encoder and ``frozen``, by name."""
+        return _given_options(self)
+
+    @property
+    def suffix(self) -> str:
+        """What stands behind method and encoder: ",frozen,task_features_dim=64"."""
+        return _suffix(self)
+
+    @property
+    def embeds_in_env(self) -> bool:
+        """Whether ``VecEncodeObservations`` embeds each observation once: nothing else needs the observation."""
+        return self.frozen and not self.task_features_dim and not self.augment
 
     @classmethod
     def of_conf_file(cls, config: str) -> "MethodSpec | None":
@@ -88,7 +124,8 @@ class MethodSpec:
         :param entry: of a zoo YAML
         :param given: hyperparameters that the user sets
         :return: ``policy_kwargs``, unless the entry gives them as a text: :meth:`policy_kwargs` takes them once rl-zoo3
-            has evaluated it; ``policy`` and, for a frozen encoder, ``vec_env_wrapper``; ``frame_stack``, where a frozen
+            has evaluated it; ``policy`` and, for a frozen encoder without task features and augmentation,
+            ``vec_env_wrapper``; ``frame_stack``, where a frozen
             encoder's observations are stacked before it; ``callback``, where the entry has no ``EncoderCallback``
         :raises ValueError: when the method has no encoder, the policy takes none, the method sets what the user sets,
             or a frozen encoder would be shown other stacks than in pretraining
@@ -100,10 +137,10 @@ class MethodSpec:
             encoder = _encoder_name(kwargs)
             replaced["policy_kwargs"] = self.policy_kwargs(kwargs)
         file = self._file(encoder)
-        if self.frozen and _image_key(file) is None:
+        if self.embeds_in_env and _image_key(file) is None:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
             replaced["vec_env_wrapper"] = [*items(entry.get("vec_env_wrapper")), wrapper]
-        if self.frozen or "policy" not in given:
+        if self.embeds_in_env or "policy" not in given:
             replaced["policy"] = self._policy(str(entry.get("policy")), _image_key(file))
         for name in sorted({"policy_kwargs", *replaced} & set(given)):
             raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
@@ -135,12 +172,16 @@ class MethodSpec:
             check_objective(file, self.name)
             replaced["features_extractor_class"] = f"sb3_abisim.{CombinedEncoderExtractor.__name__}"
             arguments = {"encoders": {key: self._encoder(shipped)}, "networks": {key: stored_network(file)}}
-            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen}
-        elif not self.frozen:
+            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen, **self.options}
+        elif not self.embeds_in_env:
             replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
+            arguments = self.options
             if method.has_encoder_file:
-                arguments = {} if file is None else network_arguments(file)
-                replaced["features_extractor_kwargs"] = {"encoder": self._encoder(shipped), **arguments}
+                network = {} if file is None else network_arguments(file)
+                frozen = {"freeze": True} if self.frozen else {}
+                arguments = {"encoder": self._encoder(shipped), **network, **frozen, **arguments}
+            if arguments:
+                replaced["features_extractor_kwargs"] = arguments
         return replaced
 
     def _encoder(self, shipped: str | None) -> str:
@@ -149,7 +190,7 @@ class MethodSpec:
         if shipped is None:
             raise ValueError(
                 f"no encoder ships for this environment; pretrain one and give its file: --conf-file {self.name}=FILE"
-                + ",frozen" * self.frozen
+                + self.suffix
             )
         return f"{shipped.rpartition('/')[0]}/{self.name}"
 
@@ -167,7 +208,7 @@ class MethodSpec:
         if image_key is not None:
             return re.sub("Mlp|Cnn", "MultiInput", policy)
         # An entry for vectors, as rl-zoo3's "default" is, has the policy without an extractor for images.
-        wrong, right = ("Cnn", "Mlp") if self.frozen else ("Mlp", "Cnn")
+        wrong, right = ("Cnn", "Mlp") if self.embeds_in_env else ("Mlp", "Cnn")
         replaced = policy.replace(wrong, right)
         # A dotted path is a custom policy.
         if right not in replaced and "." not in replaced:
@@ -187,6 +228,8 @@ class MethodRecord:
     :param encoder: path or name of the encoder file; None without one
     :param encoder_hash: sha256 of the encoder file; None without one
     :param preprocessing: hyperparameters that stand between the environment and the encoder, where they are given
+    :param task_features_dim: size of the trainable network beside the encoder, 0 for none
+    :param augment: name of an augmentation; None for that of the method
     """
 
     method: str | None
@@ -194,11 +237,13 @@ class MethodRecord:
     encoder: str | None
     encoder_hash: str | None
     preprocessing: dict[str, Any]
+    task_features_dim: int = 0
+    augment: str | None = None
 
     @property
     def label(self) -> str | None:
-        """What reports call it: "abisim", "abisim,frozen"; None for no method."""
-        return None if self.method is None else self.method + ",frozen" * self.frozen
+        """What reports call it: "abisim", "abisim,frozen,task_features_dim=64"; None for no method."""
+        return None if self.method is None else self.method + _suffix(self)
 
     def write(self, folder: str | Path) -> None:
         """Write it into the folder of ``config.yml``.
@@ -221,14 +266,24 @@ class MethodRecord:
             return None
         try:
             record = cls(**json.loads(path.read_bytes()))
-            texts = record.method, record.encoder, record.encoder_hash
+            texts = record.method, record.encoder, record.encoder_hash, record.augment
             if not all(value is None or (isinstance(value, str) and value.isprintable()) for value in texts):
                 raise TypeError("a name is no text")
             if not isinstance(record.frozen, bool) or not isinstance(record.preprocessing, dict):
                 raise TypeError("frozen is no bool, or preprocessing no mapping")
+            if type(record.task_features_dim) is not int:
+                raise TypeError("task_features_dim is no whole number")
             return record
         except (ValueError, TypeError, RecursionError) as error:
             raise ValueError(f"{path} is damaged ({error}); leave the run out, or copy the file again") from error
+
+
+def _given_options(given: MethodSpec | MethodRecord) -> dict[str, Any]:
+    return {name: value for name in _OPTIONS if (value := getattr(given, name))}
+
+
+def _suffix(given: MethodSpec | MethodRecord) -> str:
+    return ",frozen" * given.frozen + "".join(f",{name}={value}" for name, value in _given_options(given).items())
 
 
 def hyperparameters_file(algo: str, env_id: str) -> Path | None:
@@ -340,6 +395,17 @@ def encoding_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any] | None:
             kwargs: dict[str, Any] = next(iter(wrapper.values()))
             return kwargs
     return None
+
+
+def unfreezes(hyperparams: Mapping[str, Any]) -> bool:
+    """Whether the ``EncoderCallback`` of a zoo entry unfreezes a frozen encoder at some step.
+
+    :param hyperparams: of a zoo entry, or of a run's ``config.yml``
+    """
+    for item in items(hyperparams.get("callback")):
+        if isinstance(item, Mapping) and class_name(item) == ENCODER_CALLBACK.rpartition(".")[2]:
+            return (next(iter(item.values())) or {}).get("unfreeze_at") is not None
+    return False
 
 
 def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:

@@ -27,6 +27,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
 
 from sb3_abisim.networks.bounded import BoundedTensors
+from sb3_abisim.rl.unfreeze import unfreeze_encoder
 from sb3_abisim.zoo.named import named_class, named_policy_kwargs
 from sb3_abisim.zoo.run_files import read_yaml
 from sb3_abisim.zoo.runs import Run
@@ -174,11 +175,10 @@ def _require_stored(archive: zipfile.ZipFile, size: int) -> None:
 
 
 def _restore(model: BaseAlgorithm, path: Path, data: Mapping[str, Any]) -> None:
-    _, params, variables = load_from_zip_file(path, load_data=False, device="cpu")
-    for tensor in _tensors([params, variables]):
-        # One number could stand for a tensor of any size.
-        if tensor.layout != th.strided or tensor.nbytes > tensor.untyped_storage().nbytes():
-            raise ValueError("its weights are no plain tensors")
+    params, variables = _read_tensors(path)
+    if _n_optimized(params) > _n_optimized(model.get_parameters()):
+        # Saved after unfreeze_at, and built from a configuration that says freeze: true.
+        unfreeze_encoder(model)
     model.set_parameters(params, exact_match=True, device="cpu")
     for name, value in (variables or {}).items():
         if value is not None and name in model._get_torch_save_params()[1]:
@@ -191,6 +191,22 @@ def _restore(model: BaseAlgorithm, path: Path, data: Mapping[str, Any]) -> None:
         model.policy.reset_noise()  # type: ignore[operator]
 
 
+def _read_tensors(path: Path) -> tuple[dict[str, Any], Any]:
+    """The state dicts and the variables of a zip, as tensors that take no more memory than the zip."""
+    _, params, variables = load_from_zip_file(path, load_data=False, device="cpu")
+    for tensor in _tensors([params, variables]):
+        # One number could stand for a tensor of any size.
+        if tensor.layout != th.strided or tensor.nbytes > tensor.untyped_storage().nbytes():
+            raise ValueError("its weights are no plain tensors")
+    return params, variables
+
+
+def _n_optimized(parameters: Mapping[str, Any]) -> int:
+    """How many parameters the optimizers hold, of a model's ``get_parameters()``."""
+    states = [state for state in parameters.values() if isinstance(state, Mapping)]
+    return sum(len(group["params"]) for state in states for group in state.get("param_groups", ()))
+
+
 def _tensors(value: Any) -> Iterator[th.Tensor]:
     if isinstance(value, th.Tensor):
         yield value
@@ -201,16 +217,19 @@ def _tensors(value: Any) -> Iterator[th.Tensor]:
             yield from _tensors(part)
 
 
-def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """What a saved model holds that can be read without unpickling.
 
     :param path: the zip
-    :return: its JSON, in which pickled values are texts, and the state dicts of the policy and of optimizers by name
+    :return: its JSON, in which pickled values are texts, and the weights of its policy by name
     :raises ValueError: for a damaged zip, or anything else
     """
     try:
         data, _ = _read_data(path)
-        _, params, _ = load_from_zip_file(path, load_data=False, device="cpu")
+        params, _ = _read_tensors(path)
+        policy = params["policy"]
+        if not all(isinstance(weights, th.Tensor) for weights in policy.values()):
+            raise ValueError("its policy holds other things than tensors")
     except Exception as error:
         raise ValueError(f"{path} is damaged or no model of Stable-Baselines3 ({error}); copy it again") from error
-    return data, params
+    return data, policy

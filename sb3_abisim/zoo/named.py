@@ -5,6 +5,7 @@ The texts in which rl-zoo3 keeps ``policy_kwargs`` and ``normalize`` are Python.
 
 import ast
 import importlib
+import re
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -89,6 +90,14 @@ def _local(value: Any, where: str) -> Any:
         network = value.get("network")
         if isinstance(network, str) and is_import_path(network) and network not in networks():
             raise ValueError(f"{where} names the network {network!r}; if you trust it, add --packages {network}")
+        augment = value.get("augment")
+        if (
+            isinstance(augment, str)
+            and is_import_path(augment)
+            and re.split("[.:]", augment)[0] not in named_packages()
+        ):
+            package = augment.partition(":")[0]
+            raise ValueError(f"{where} names the augmentation {augment!r}; if you trust it, add --packages {package}")
         return {name: _local(part, where) for name, part in value.items()}
     if isinstance(value, list | tuple):
         return type(value)(_local(part, where) for part in value)

@@ -26,6 +26,7 @@ from sb3_abisim.analysis.nav2d_exact import (
     spearman,
     step_profile,
 )
+from sb3_abisim.analysis.pixels import pixel_maps
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.networks.paper import Nav2DEncoder
 
@@ -58,6 +59,15 @@ def test_states_are_those_of_the_environment(env_id):
         observation, _, terminated, truncated, _ = env.step(int(generator.integers(4)))
         if terminated or truncated:
             break
+
+
+def test_states_with_the_goal_elsewhere_are_refused():
+    """They are rendered with it in the center."""
+    with pytest.raises(ValueError, match=r"goal of Nav2DRandomGoal-v0 is not in the center, .*; give Nav2D-v0"):
+        eval_layouts("Nav2DRandomGoal-v0", 1)
+    env_id = "ContinuousPointMazeRandomGoal-v0"
+    with pytest.raises(ValueError, match=f"goal of {env_id} is not in the center, .*; give ContinuousPointMaze-v0"):
+        pixel_maps({}, env_id, 1)
 
 
 def test_reachable_cells_by_flood_fill():

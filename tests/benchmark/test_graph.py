@@ -296,3 +296,19 @@ def test_an_encoder_of_other_wrappers_is_refused_before_any_job(tmp_path: Path) 
     with pytest.raises(ValueError, match=r"env_wrapper: \['a.B'\] in pretraining, \[\] now.*add -params"):
         build(plan)
     assert build(dataclasses.replace(plan, params=("env_wrapper:a.B",)))
+
+
+def test_options_of_a_method_are_another_arm() -> None:
+    """The same encoder under both, and labels that a report tells apart."""
+    methods = ("abisim,frozen", "abisim,frozen,task_features_dim=8,augment=random_shift", "drq")
+    plan = dataclasses.replace(PLAN, methods=methods, env_ids=("Nav2D-v0",), seeds=(0,))
+    jobs = build(plan)
+    plain, more, drq = (job for job in jobs if job.kind == "run")
+    assert plain.inputs == more.inputs != () == drq.inputs and len({plain.name, more.name, drq.name}) == 3
+    assert list(run_labels(jobs).values()) == list(methods)
+    told = {name: value for name, value in more.settings.items() if name not in plain.settings}
+    assert told == {"task_features_dim": 8, "augment": "random_shift"}
+    conf_file = more.command[more.command.index("--conf-file") + 1]
+    assert conf_file == f"abisim={more.inputs[0].output},frozen,task_features_dim=8,augment=random_shift"
+    assert "/abisim-frozen-task_features_dim-8-augment-random_shift-" in more.output
+    assert drq.command[drq.command.index("--conf-file") + 1] == "drq"

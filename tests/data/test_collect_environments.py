@@ -9,6 +9,7 @@ import pytest
 
 from sb3_abisim.data import chains
 from sb3_abisim.data.collect import collect, main
+from sb3_abisim.data.copies import EnvCopies
 from sb3_abisim.data.dataset import TransitionDataset
 
 
@@ -86,3 +87,21 @@ def test_env_kwargs_may_be_given_one_by_one(tmp_path: Path) -> None:
     words = ["--env", "IndexEnv-v0", "-n", "10", "-o", str(tmp_path / "d"), "--n-envs", "2"]
     main([*words, "--env-kwargs", "offset:1", "--env-kwargs", "max_episode_steps:3"])
     assert TransitionDataset(tmp_path / "d").env_kwargs == {"offset": 1, "max_episode_steps": 3}
+
+
+def test_environments_are_closed_once_and_not_when_never_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gymnasium 1.2 closes a vector environment again, and one whose making failed, when it is collected."""
+    closed: list[object] = []
+    monkeypatch.setattr(index_env.PlainEnv, "close", lambda self: closed.append(self))
+    copies = EnvCopies([index_env.PlainEnv] * 3)
+    copies.close()
+    copies.close()
+    assert closed == copies.envs and len(closed) == 3
+    EnvCopies.__new__(EnvCopies).close()
+    assert len(closed) == 3
+
+
+def test_a_wrapper_that_asserts_without_a_word(tmp_path: Path) -> None:
+    """As those of Gymnasium 1.2 that render do."""
+    with pytest.raises(ValueError, match=r"where a wrapper renders, add --env-kwargs render_mode:rgb_array"):
+        collect("PlainEnv-v0", 50, tmp_path / "d", env_wrapper="index_env.SilentWrapper")

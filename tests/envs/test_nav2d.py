@@ -4,9 +4,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from sb3_abisim.envs.nav2d import GOAL, LAYOUTS, MOVES, Nav2DEnv, Nav2DVectorEnv
+from sb3_abisim.envs.nav2d import CORNERS, GOAL, LAYOUTS, MOVES, Nav2DEnv, Nav2DVectorEnv
 
-IDS = ["Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0"]
+IDS = ["Nav2D-v0", "Nav2DCorridor-v0", "Nav2DMaze-v0", "Nav2DRandomGoal-v0"]
 
 
 def cells(observation):
@@ -35,7 +35,7 @@ def test_steps_follow_the_rules(env_id):
     for episode in range(30):
         observation, _ = env.reset(seed=episode)
         (x, y), obstacles, goal = cells(observation)
-        assert goal == GOAL == (7, 7) and (x, y) != goal
+        assert (x, y) != goal and (goal == GOAL == (7, 7) or env_id == "Nav2DRandomGoal-v0")
         for step in range(1, 51):
             action = int(rng.integers(4))
             dx, dy = ((0, -1), (0, 1), (-1, 0), (1, 0))[action]
@@ -44,8 +44,8 @@ def test_steps_follow_the_rules(env_id):
             expected = target if inside and target not in obstacles else (x, y)
             moved, blocked = moved + (expected != (x, y)), blocked + (expected == (x, y))
             observation, reward, terminated, truncated, info = env.step(action)
-            (x, y), now, _ = cells(observation)
-            assert ((x, y), now) == (expected, obstacles)
+            (x, y), now, there = cells(observation)
+            assert ((x, y), now, there) == (expected, obstacles, goal)
             assert (reward, terminated, info["is_success"]) == (
                 (0.0, True, True) if expected == goal else (-1.0, False, False)
             )
@@ -98,6 +98,46 @@ def test_render_shows_the_agent(env_id):
     assert tuple(np.argwhere(red).mean(axis=0) // 32) == agent[::-1]
 
 
+@pytest.mark.parametrize("layout", ["random", *LAYOUTS])
+def test_random_goals_lie_on_any_cell_that_the_agent_can_reach(layout):
+    env = Nav2DVectorEnv(num_envs=1200, layout=layout, goal="random")
+    observations, _ = env.reset(seed=0)
+    goals, agents = [], []
+    for observation, factor in zip(observations, env.factors()["goal"], strict=True):
+        agent, obstacles, goal = cells(observation)
+        assert goal == tuple(factor) != agent and goal not in obstacles
+        assert goal in reachable(agent, obstacles)
+        goals.append(goal)
+        agents.append(agent)
+    free = 225 if layout == "random" else "".join(LAYOUTS[layout]).count(".")
+    assert len(set(goals)) > 0.97 * free and len(set(agents)) > 0.97 * free
+    # All are as likely, also at the border, which fewer obstacles would cover.
+    assert max(map(goals.count, goals)) < 3 * max(1200 / free, 6)
+    if layout == "random":
+        assert sum(not {0, 14}.isdisjoint(goal) for goal in goals) == pytest.approx(1200 * 56 / 225, abs=24)
+
+
+def test_goals_in_the_corners():
+    env = Nav2DVectorEnv(num_envs=400, goal="corners")
+    observations, _ = env.reset(seed=0)
+    goals = []
+    for observation, factor in zip(observations, env.factors()["goal"], strict=True):
+        agent, obstacles, goal = cells(observation)
+        assert goal == tuple(factor) != agent and goal in reachable(agent, obstacles)
+        goals.append(goal)
+    assert {goal: goals.count(goal) for goal in goals} == pytest.approx(dict.fromkeys(CORNERS, 100), abs=30)
+
+
+def test_a_center_goal_is_not_sampled():
+    """The episodes of a seed are those of before there were random goals."""
+    generator = np.random.default_rng(5)
+    cell = int(generator.integers(224))
+    agent = cells(Nav2DEnv().reset(seed=5)[0])[0]
+    cell += cell >= 7 * 15 + 7
+    assert agent == (cell % 15, cell // 15)
+    assert "goal" not in Nav2DVectorEnv(num_envs=2).factors()
+
+
 def test_factors_describe_the_observation():
     batch = Nav2DVectorEnv(num_envs=3)
     observations, _ = batch.reset(seed=0)
@@ -110,3 +150,7 @@ def test_factors_describe_the_observation():
 def test_unknown_layout():
     with pytest.raises(ValueError, match="spiral"):
         Nav2DEnv(layout="spiral")
+    with pytest.raises(ValueError, match="goal must be 'center', 'random' or 'corners', got 'corner'"):
+        Nav2DEnv(goal="corner")
+    with pytest.raises(ValueError, match="goal='corners' may be blocked in layout='maze'; give goal='random'"):
+        Nav2DEnv(layout="maze", goal="corners")

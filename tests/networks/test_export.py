@@ -13,6 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_abisim import ActionBisimExtractor, VanillaExtractor, load_encoder
 from sb3_abisim.__main__ import main
+from sb3_abisim.common.extras import is_installed
 from sb3_abisim.networks import export as export_module
 from sb3_abisim.networks.base import preprocess
 from sb3_abisim.networks.encoder_file import EncoderNotFoundError, reference_batch
@@ -77,7 +78,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
     monkeypatch.setitem(export_module._NEEDED, ".onnx", ("onnx", "no_such_module"))
     with pytest.raises(SystemExit, match="2"):
         main(["export", "Nav2D-v0/abisim", "-o", "e.onnx"])
-    assert "no_such_module: pip install 'sb3_abisim[export]'" in capsys.readouterr().err
+    assert "no_such_module); run: pip install 'sb3_abisim[export]'" in capsys.readouterr().err
 
 
 def test_the_examples_of_the_docs(tmp_path: Path) -> None:
@@ -86,7 +87,7 @@ def test_the_examples_of_the_docs(tmp_path: Path) -> None:
     export_encoder("PointMaze-v0/abisim", tmp_path / "encoder.pt2")
     for block in blocks:
         if "onnxruntime" in block:
-            if any(not export_module.importlib.util.find_spec(name) for name in export_module._NEEDED[".onnx"]):
+            if any(not is_installed(name) for name in export_module._NEEDED[".onnx"]):
                 continue
             export_encoder("PointMaze-v0/abisim", tmp_path / "encoder.onnx")
         subprocess.run([sys.executable, "-c", block], cwd=tmp_path, check=True)

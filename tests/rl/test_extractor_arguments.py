@@ -29,6 +29,7 @@ NAMES = {
     "acro": "ACROExtractor",
     "beta_vae": "BetaVAEExtractor",
     "curl": "CURLExtractor",
+    "drq": "DrQExtractor",
     "foreign": "ForeignExtractor",
     "info_nce": "InfoNCEExtractor",
     "ssi": "SSIExtractor",
@@ -41,7 +42,8 @@ def test_every_method_has_an_extractor(method: str) -> None:
     made: Any = extractor_class(method)
     assert made.__name__ == NAMES[method] and getattr(sb3_abisim, NAMES[method]) is made
     assert method_of(made) == method
-    assert issubclass(made, VanillaExtractor) if method == "vanilla" else made.objective == method
+    untrained = method in ("vanilla", "drq")
+    assert issubclass(made, VanillaExtractor) if untrained else made.objective == method
     assert ":param observation_space:" in made.__doc__ and ":param network_kwargs:" in made.__doc__
     # A class of the same name belongs to nobody.
     assert method_of(type(NAMES[method], (PretrainedExtractor,), {})) is None

@@ -8,9 +8,11 @@ import pytest
 import stable_baselines3 as sb3
 import torch as th
 from extractor_inputs import OBSERVATIONS, SPACE, VARIANTS, RandomImages, build, write
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
-from sb3_abisim import ActionBisimExtractor, load_encoder, unfreeze_encoder
+from sb3_abisim import ActionBisimExtractor, EncoderCallback, VecEncodeObservations, load_encoder, unfreeze_encoder
 from sb3_abisim.rl.checks import find_extractors
 from sb3_abisim.rl.extractors import PretrainedExtractor
 
@@ -92,3 +94,112 @@ def test_a_model_that_could_not_be_loaded_again_is_left_as_it_is(tmp_path: Path)
     with pytest.raises(ValueError, match=r"hold no freeze=True.*take freeze as an argument"):
         unfreeze_encoder(model)
     assert find_extractors(model.policy)[0][1].frozen
+
+
+# At a step of a run.
+
+
+class Steps(BaseCallback):
+    """Notes at which step each update came, and whether it moved the encoder."""
+
+    def _on_training_start(self) -> None:
+        self.found: list[tuple[int, bool]] = []
+        self._old = self._weights()
+
+    def _weights(self) -> list[th.Tensor]:
+        return [e._flat_weights().clone() for _, e in find_extractors(self.model.policy)]
+
+    def _on_rollout_start(self) -> None:
+        new = self._weights()
+        self.found.append((self.num_timesteps, any(not th.equal(a, b) for a, b in zip(self._old, new, strict=True))))
+        self._old = new
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def continuous(name: str) -> bool:
+    return name in ("SAC", "TD3", "TQC")
+
+
+@pytest.mark.parametrize("name, other_sharing", VARIANTS)
+def test_at_a_step(tmp_path: Path, name: str, other_sharing: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path / "e.safetensors", "BatchNorm")
+    more = {} if name in ("A2C", "QRDQN") else {"optimizer_class": th.optim.SGD, "optimizer_kwargs": {}}
+    model = build(name, path, True, other_sharing, more, network="BatchNorm")
+    target = getattr(model, "critic_target", getattr(model, "q_net_target", None))
+    settings: dict[str, Any] = {"unfreeze_at": 15}
+    if name != "TRPO":
+        settings["encoder_lr"] = "lin_1e-3"
+    if continuous(name) and other_sharing:
+        settings["encoder_trained_by"] = "critic"
+    steps = Steps()
+    model.learn(32, callback=CallbackList([EncoderCallback(**settings), steps]))
+    # An update is noted with the step of the rollout that comes after it.
+    assert {moved for step, moved in steps.found if step < 15} == {False}
+    updates = {step: moved for step, moved in steps.found if step >= 15}
+    assert all(updates.values()) and min(updates) == 16
+    out = capsys.readouterr().out
+    assert out.count("Encoder: frozen until step 15") == 1 and out.count("Encoder: fine-tuned from step 16 on") == 1
+    if target is not None:
+        (frozen,) = {module.frozen for module in target.modules() if isinstance(module, PretrainedExtractor)}
+        (moved,) = {m.relative_weight_change() > 0 for m in target.modules() if isinstance(m, PretrainedExtractor)}
+        assert not frozen and moved
+
+
+def test_the_update_at_the_step_itself_trains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path / "e.safetensors", "BatchNorm")
+    for unfreeze_at in (16, 17):
+        build("PPO", path, True, network="BatchNorm").learn(32, callback=EncoderCallback(unfreeze_at=unfreeze_at))
+        is_at_16 = "Encoder: fine-tuned from step 16 on" in capsys.readouterr().out
+        assert is_at_16 == (unfreeze_at == 16)
+
+
+@pytest.mark.parametrize("name", ["PPO", "A2C", "DQN", "SAC", "TD3"])
+@pytest.mark.parametrize("before", [True, False])
+def test_continued_on_either_side(tmp_path: Path, name: str, before: bool) -> None:
+    path = write(tmp_path / "e.safetensors")
+    settings: dict[str, Any] = {"unfreeze_at": 15, "encoder_lr": 1e-4}
+    if continuous(name):
+        settings["encoder_trained_by"] = "critic"
+    states = []
+    for is_loaded in (False, True):
+        model = build(name, path, True, continuous(name))
+        model.learn(8 if before else 24, callback=EncoderCallback(**settings))
+        model.save(tmp_path / "model.zip")
+        if is_loaded:
+            loaded = type(model).load(tmp_path / "model.zip", env=RandomImages(continuous(name)), device="cpu")
+            loaded.replay_buffer = getattr(model, "replay_buffer", None)
+            model = loaded
+        else:
+            model.set_env(RandomImages(continuous(name)))
+        model.set_random_seed(3)
+        model._last_obs = None
+        # Steps are counted anew where rl-zoo3 continues a run.
+        model.learn(24, callback=EncoderCallback(**settings), reset_num_timesteps=before)
+        assert not find_extractors(model.policy)[0][1].frozen
+        assert find_extractors(model.policy)[0][1].relative_weight_change() > 0
+        states.append(model.policy.state_dict())
+    assert all(th.equal(value, states[1][key]) for key, value in states[0].items())
+
+
+def test_what_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "e.safetensors")
+    for wrong in (0, -5, 1.5, "100", True):
+        with pytest.raises(ValueError, match="unfreeze_at must be a whole number of environment steps above 0, got"):
+            EncoderCallback(unfreeze_at=wrong)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="unfreeze_at=9, but the policy holds no frozen encoder; give freeze"):
+        build("PPO", path, False).learn(8, callback=EncoderCallback(unfreeze_at=9))
+    env = VecEncodeObservations(DummyVecEnv([RandomImages]), str(path), device="cpu")
+    model = sb3.PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu")
+    with pytest.raises(ValueError, match=r"embeds observations in the environment.*give freeze: true"):
+        model.learn(8, callback=EncoderCallback(unfreeze_at=9))
+    kwargs = {"features_extractor_class": Own, "features_extractor_kwargs": {"encoder": str(path)}}
+    own = sb3.PPO("CnnPolicy", RandomImages(), n_steps=8, batch_size=8, policy_kwargs=kwargs, device="cpu")
+    # Before anything is learned, and not when the step has come.
+    with pytest.raises(ValueError, match="take freeze as an argument"):
+        own.learn(8, callback=EncoderCallback(unfreeze_at=9))
+    assert own.num_timesteps == 0
+    never = build("PPO", path, True)
+    never.learn(8, callback=EncoderCallback(unfreeze_at=9))
+    assert find_extractors(never.policy)[0][1].frozen

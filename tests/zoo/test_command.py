@@ -33,6 +33,8 @@ ROOT = Path(__file__).resolve().parents[2]
     ("algo", "env_id", "method"),
     [
         ("ppo", "Nav2D-v0", "ssi,frozen"),
+        ("ppo", "Nav2D-v0", "ssi,frozen,task_features_dim=8,augment=random_shift"),
+        ("dqn", "Nav2D-v0", "drq"),
         ("ppo", "PointMaze-v0", "vanilla"),
         ("dqn", "Nav2D-v0", "abisim"),
         ("ppo", "ContinuousDistractorPointMaze-v0", "beta_vae"),
@@ -48,15 +50,15 @@ def test_train_and_enjoy(
     method: str,
 ) -> None:
     hash, word, encoder = "", method, tmp_path / "mine.safetensors"
-    if method != "vanilla":
-        name, comma, frozen = method.partition(",")
+    if method not in ("vanilla", "drq"):
+        name, comma, rest = method.partition(",")
         hash = write_encoder(encoder, env_id, name)
-        word = f"{name}={encoder}{comma}{frozen}"
+        word = f"{name}={encoder}{comma}{rest}"
     common = ["--algo", algo, "--env", env_id, "-f", str(tmp_path), "--num-threads", "1"]
     small = ["--eval-freq", "200", "--eval-episodes", "1", "-params", *SMALL[algo]]
     run(monkeypatch, "train", *common, "-n", "300", "--seed", "1", "--conf-file", word, *small)
     out = capsys.readouterr().out
-    state = "frozen" if method.endswith("frozen") else "fine-tuned" if hash else "trained from scratch"
+    state = "frozen" if "frozen" in method else "fine-tuned" if hash else "trained from scratch"
     # One line for each network with a separate encoder.
     assert out.count("Encoder ") == (2 if algo == "sac" else 1)
     assert f"hash {hash}" in out if hash else "random weights" in out
@@ -153,6 +155,12 @@ def test_values_reach_rl_zoo3(
     assert args["gym_packages"] == ["toy_env"]
 
 
+# In one word: a pair for the only argument of the callback.
+FINE_TUNED = (
+    '--env Nav2D-v0 -params callback:{{"sb3_abisim.EncoderCallback":{{"{}":{}}}}} n_envs:2 n_steps:32 batch_size:32'
+)
+
+
 # rl-zoo3 leaves the monitor files open that it had opened before the mistake.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
@@ -169,6 +177,11 @@ def test_values_reach_rl_zoo3(
         ("--env Nav2D-v0 --packages no_such_module", "--packages: cannot import 'no_such_module'"),
         ("--env Nav2D-v0 -i no_such_model.zip", "trained_agent must be a valid path"),
         ("--env Toy-v0 --packages toy_env --conf-file ssi", "no encoder ships for this environment"),
+        (f"{FINE_TUNED.format('unfreeze_at', 9)} --conf-file vanilla", "the policy holds no frozen encoder"),
+        (f"{FINE_TUNED.format('unfreeze_at', 9)} --conf-file abisim,frozen", "give freeze: true in features_extractor"),
+        (f"{FINE_TUNED.format('encoder_lr', 0)} --conf-file vanilla", "encoder_lr must be a number above 0"),
+        (f"{FINE_TUNED.format('encoder_lrr', 1)} --conf-file vanilla", "unexpected keyword argument 'encoder_lrr'"),
+        (f"{FINE_TUNED.format('encoder_trained_by', 'critic')} --conf-file vanilla", "is for SAC, TD3 and TQC"),
     ],
 )
 def test_mistakes_are_one_line(

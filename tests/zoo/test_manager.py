@@ -20,12 +20,13 @@ from sb3_abisim.common.paths import resource_path
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
 from sb3_abisim.registry import get_method, methods
-from sb3_abisim.rl.checks import check_trained_with
+from sb3_abisim.rl.checks import check_trained_with, find_extractors
 from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.extractors import VanillaExtractor
 from sb3_abisim.rl.file_network import network_arguments
 from sb3_abisim.zoo.manager import MethodExperimentManager, install, with_eval_split
 from sb3_abisim.zoo.methods import ENCODING_WRAPPER, MethodRecord, encoding_kwargs, read_entries
+from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.runs import read_run
 
 exp_manager = importlib.import_module("rl_zoo3.exp_manager")
@@ -272,6 +273,40 @@ def test_a_run_goes_on_with_its_encoder_or_not_at_all(manager: Any, tmp_path: Pa
         experiment(mine, agent)
 
 
+def test_a_run_that_unfreezes_goes_on_from_either_side(manager: Any, tmp_path: Path) -> None:
+    file, agent = tmp_path / "mine.safetensors", tmp_path / "agent.zip"
+    write_encoder(file, "Nav2D-v0", "ssi")
+    kwargs = {"encoder": str(file), "freeze": True}
+    entry = {
+        "policy": "CnnPolicy",
+        "policy_kwargs": {"features_extractor_class": "sb3_abisim.SSIExtractor", "features_extractor_kwargs": kwargs},
+        "callback": [{"sb3_abisim.EncoderCallback": {"unfreeze_at": 24, "encoder_lr": "lin_1e-4"}}],
+        **{"n_timesteps": 32, "n_envs": 2, "n_steps": 8, "batch_size": 8},
+    }
+    config = tmp_path / "mine.yml"
+    config.write_text(yaml.safe_dump({"Nav2D-v0": entry}))
+    for n_timesteps, continued, is_frozen in ((16, False, True), (48, True, False), (48, True, False)):
+        trained_agent = str(agent) if continued else ""
+        given = {"trained_agent": trained_agent, "eval_freq": -1, "log_interval": -1, "n_timesteps": n_timesteps}
+        made = manager("ppo", "Nav2D-v0", str(config), **given)
+        made.args = argparse.Namespace()
+        model = made.setup_experiment()[0]
+        before = find_extractors(model.policy)[0][1].relative_weight_change()
+        made.learn(model)
+        made.save_trained_model(model)
+        model.save(agent)
+        (_, extractor), *_ = find_extractors(model.policy)
+        assert extractor.frozen == is_frozen and (extractor.relative_weight_change() != before) is not is_frozen
+        # Built from the YAML, which says freeze: true, and from the weights.
+        run: Any = types.SimpleNamespace(folder=Path(made.save_path), env_name="Nav2D-v0", algo="ppo")
+        record = MethodRecord.read(made.params_path)
+        assert record is not None and record.label == "ssi"
+        built = load_model(Path(made.save_path) / "Nav2D-v0.zip", run)
+        assert find_extractors(built.policy)[0][1].frozen == is_frozen
+        state = built.policy.state_dict()
+        assert all(th.equal(value, state[name]) for name, value in model.policy.state_dict().items())
+
+
 def test_evaluation_is_in_the_environment_of_training(manager: Any) -> None:
     """rl-zoo3 gives it the arguments of --env-kwargs, not those among the hyperparameters."""
     chosen = {"hyperparams": {"env_kwargs": {"max_episode_steps": 20}}}
@@ -364,7 +399,10 @@ def test_records_say_what_a_run_used(manager: Any, tmp_path: Path) -> None:
     for config, kwargs, expected in (
         (f"ssi={path}", None, MethodRecord("ssi", False, str(path), hash, normalize)),
         (f"ssi={path},frozen", None, MethodRecord("ssi", True, str(path), hash, normalize)),
+        (f"ssi={path},frozen,task_features_dim=4", None, MethodRecord("ssi", True, str(path), hash, normalize, 4)),
         ("vanilla", None, MethodRecord("vanilla", False, None, None, normalize)),
+        ("drq", None, MethodRecord("drq", False, None, None, normalize)),
+        ("vanilla,augment=random_crop", None, MethodRecord("vanilla", False, None, None, normalize, 0, "random_crop")),
         (str(tmp_path / "custom.yml"), {}, MethodRecord(None, False, None, None, {})),
         (
             str(tmp_path / "custom.yml"),

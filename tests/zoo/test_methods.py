@@ -12,7 +12,6 @@ from torch import nn
 from zoo_inputs import write_encoder
 
 from sb3_abisim.rl.extractor_classes import extractor_class
-from sb3_abisim.rl.optimizers import EncoderLRAdam
 from sb3_abisim.zoo.methods import (
     ENCODER_CALLBACK,
     ENCODING_WRAPPER,
@@ -29,9 +28,23 @@ def test_method_specs() -> None:
     assert MethodSpec.parse("abisim,frozen") == MethodSpec("abisim", None, True)
     assert MethodSpec.parse("abisim=a=b,c.safetensors") == MethodSpec("abisim", "a=b,c.safetensors", False)
     assert MethodSpec.parse("ssi=hf://o/r/f.safetensors,frozen") == MethodSpec("ssi", "hf://o/r/f.safetensors", True)
+    assert MethodSpec.parse("vanilla,task_features_dim=8") == MethodSpec("vanilla", task_features_dim=8)
+    with pytest.raises(ValueError, match="cannot import the augmentation 'no_such_module:f'"):
+        MethodSpec.parse("vanilla,augment=no_such_module:f")
+    for text in ("ssi=a=b,1,frozen,task_features_dim=8,augment=random_crop", "ssi=a=b,1,augment=random_crop,{},frozen"):
+        spec = MethodSpec.parse(text.format("task_features_dim=8"))
+        assert spec == MethodSpec("ssi", "a=b,1", True, 8, "random_crop")
+        assert spec.suffix == ",frozen,task_features_dim=8,augment=random_crop"
+        assert spec.options == {"task_features_dim": 8, "augment": "random_crop"}
+    assert MethodSpec.parse("drq,task_features_dim=0").options == {}
 
 
-@pytest.mark.parametrize("text", ["", "acroo", "abisim,freeze", "ssi=", "ssi=,frozen", "vanilla=x", "vanilla,frozen"])
+WRONG = "acroo", "abisim,freeze", "ssi=", "ssi=,frozen", "vanilla=x", "vanilla,frozen", "drq,frozen", "abisim,task=8"
+WRONG_OPTIONS = "abisim,task_features_dim=", "abisim,task_features_dim=2.5", "abisim,task_features_dim=-1"
+TWICE = "abisim,frozen,frozen", "abisim,augment=random_crop,augment=random_shift"
+
+
+@pytest.mark.parametrize("text", ["", *WRONG, *WRONG_OPTIONS, *TWICE])
 def test_wrong_method_specs(text: str) -> None:
     with pytest.raises(ValueError, match=r"give METHOD|takes neither"):
         MethodSpec.parse(text)
@@ -75,6 +88,30 @@ def test_an_entry_of_this_package() -> None:
         "policy": "MlpPolicy",
         "policy_kwargs": {"net_arch": [7]},
         "vec_env_wrapper": [{ENCODING_WRAPPER: {"encoder": "Toy-v0/ssi", "objective": "ssi"}}],
+    }
+
+
+def test_what_a_frozen_encoder_does_not_see_is_not_thrown_away() -> None:
+    """Task features and augmentation need the observation, which ``VecEncodeObservations`` would replace."""
+    for options in ({"task_features_dim": 8}, {"augment": "random_shift"}):
+        spec = MethodSpec("ssi", None, True, **options)
+        assert not spec.embeds_in_env and MethodSpec("ssi", None, True).embeds_in_env
+        kwargs = {"encoder": "Toy-v0/ssi", "freeze": True, **options}
+        assert spec.hyperparameters(ENTRY) == {
+            "policy": "CnnPolicy",
+            "policy_kwargs": {
+                "features_extractor_class": "sb3_abisim.SSIExtractor",
+                "features_extractor_kwargs": kwargs,
+                "net_arch": [7],
+            },
+        }
+        assert spec.hyperparameters({**ENTRY, "policy": "MlpPolicy"})["policy"] == "CnnPolicy"
+        # The zoo stacks observations then, as for an encoder that is fine-tuned.
+        assert "frame_stack" not in spec.hyperparameters({**ENTRY, "frame_stack": 4})
+    drq = MethodSpec("drq", task_features_dim=8).policy_kwargs({})
+    assert drq == {
+        "features_extractor_class": "sb3_abisim.DrQExtractor",
+        "features_extractor_kwargs": {"task_features_dim": 8},
     }
 
 
@@ -152,14 +189,14 @@ def test_classes_by_dotted_path() -> None:
     kwargs = {
         "features_extractor_class": "sb3_abisim.SSIExtractor",
         "activation_fn": "torch.nn.ReLU",
-        "optimizer_class": "sb3_abisim.EncoderLRAdam",
+        "optimizer_class": "torch.optim.AdamW",
         "net_arch": {"pi": [7]},
     }
     before = dict(kwargs)
     assert resolve_classes(kwargs) == {
         "features_extractor_class": extractor_class("ssi"),
         "activation_fn": nn.ReLU,
-        "optimizer_class": EncoderLRAdam,
+        "optimizer_class": th.optim.AdamW,
         "net_arch": {"pi": [7]},
     }
     assert kwargs == before
@@ -179,6 +216,10 @@ def test_arguments_of_the_encoding_wrapper() -> None:
         assert encoding_kwargs(none) is None
 
 
+# Of the records that were written before there were options.
+KEYS = "method", "frozen", "encoder", "encoder_hash", "preprocessing"
+
+
 def test_records(tmp_path: Path) -> None:
     assert MethodRecord.read(tmp_path) is None
     record = MethodRecord("ssi", True, "e", "0" * 64, {"frame_stack": 4, "env_wrapper": [nn.Module]})
@@ -189,7 +230,15 @@ def test_records(tmp_path: Path) -> None:
     assert read is not None and (read.label, read.encoder_hash) == ("ssi,frozen", "0" * 64)
     assert MethodRecord("ssi", False, "e", None, {}).label == "ssi"
     assert MethodRecord(None, False, None, None, {}).label is None
-    for text in ("{", "[]", "{}", json.dumps({**document, "more": 1})):
+    more = MethodRecord("ssi", True, "e", None, {}, 8, "random_crop")
+    more.write(tmp_path)
+    assert MethodRecord.read(tmp_path) == more and more.label == "ssi,frozen,task_features_dim=8,augment=random_crop"
+    # As those of before are.
+    (tmp_path / "method.json").write_text(json.dumps({key: document[key] for key in list(document) if key in KEYS}))
+    before = MethodRecord.read(tmp_path)
+    assert before is not None and before.label == "ssi,frozen"
+    wrong = [json.dumps({**document, **more}) for more in ({"more": 1}, {"task_features_dim": "8"}, {"augment": 1})]
+    for text in ("{", "[]", "{}", *wrong):
         (tmp_path / "method.json").write_text(text)
         with pytest.raises(ValueError, match=r"method\.json is damaged .*leave the run out"):
             MethodRecord.read(tmp_path)

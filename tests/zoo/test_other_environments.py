@@ -143,6 +143,8 @@ def test_train_enjoy_and_evaluate(
         "encoder": str(encoder),
         "encoder_hash": hash,
         "preprocessing": {},
+        "task_features_dim": 0,
+        "augment": None,
     }
     assert read_run(folder).label == "ssi" + ",frozen" * (kind == "frozen")
     assert len(np.load(folder / "evaluations.npz")["timesteps"]) == 2

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from sb3_abisim.envs.base import BatchEnv, SingleEnv
 from sb3_abisim.envs.point_maze import top_down
 from sb3_abisim.envs.point_maze.layout import (
-    GOAL_MASK,
     GOAL_RADIUS,
     N_OBSTACLES,
     OBSTACLE_PIXELS,
     PIXELS_PER_METER,
     WALL_PIXELS,
+    goal_mask,
     sample_layout,
     static_layer,
     to_meters,
@@ -115,7 +115,9 @@ class PointMazeVectorEnv(BatchEnv):
     obstacles of 2 m x 2 m with corners on the pixel grid, uniform over the room outside the 2 m x 2 m square around the
     goal; they may overlap. The start is uniform over the positions that keep 0.125 m between the ball's center and
     everything solid and lie outside the goal. Obstacles and start are sampled again until a corridor 0.5 m wide leads
-    from the start to the goal, which is the center (0, 0).
+    from the start to the goal, which is the center (0, 0). With ``goal="random"`` (``PointMazeRandomGoal-v0`` and its
+    siblings) each episode samples the goal first, uniformly over the corners between pixels at least 1 m inside the
+    walls; with ``"corners"`` from (-3.5, -3.5), (3.5, -3.5), (-3.5, 3.5) and (3.5, 3.5).
 
     **Actions.** 0, 1, 2, 3 push with full force up, down, left, right; with ``continuous`` a force (x, y) in
     ``Box(-1, 1, (2,), float32)``, x to the right and y down, in units of 100 N per axis.
@@ -139,12 +141,13 @@ class PointMazeVectorEnv(BatchEnv):
     :param num_envs: number of copies, at least 1
     :param continuous: two-dimensional forces instead of four pushes
     :param reward_type: "step" or "sparse"
+    :param goal: "center", "random" or "corners"
     :param momentum: keep the velocity from one step to the next
     :param n_threads: threads for the physics, at least 1; the results do not depend on it
     :param max_episode_steps: steps after which an episode is truncated, None for no limit
     :param render_mode: None or "rgb_array", which renders 512 x 512 pixels
     :param autoreset: False leaves finished copies for :class:`PointMazeEnv` to reset
-    :raises ValueError: for an unknown ``reward_type`` or ``n_threads`` below 1
+    :raises ValueError: for an unknown ``reward_type`` or ``goal``, or ``n_threads`` below 1
     """
 
     def __init__(
@@ -157,7 +160,10 @@ class PointMazeVectorEnv(BatchEnv):
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         autoreset: bool = True,
+        goal: str = "center",
     ) -> None:
+        if goal not in ("center", "random", "corners"):
+            raise ValueError(f"goal must be 'center', 'random' or 'corners', got {goal!r}")
         if reward_type not in ("step", "sparse"):
             raise ValueError(f"reward_type must be 'step' or 'sparse', got {reward_type!r}")
         if not 1 <= n_threads <= MAX_THREADS:
@@ -172,6 +178,9 @@ class PointMazeVectorEnv(BatchEnv):
         self.continuous = continuous
         self.reward_type = reward_type
         self.momentum = momentum
+        self.goal = goal
+        # In meters.
+        self._goals = np.zeros((num_envs, 2))
         self._connect(n_threads)
         self._layers = np.zeros((num_envs, *observation_space.shape), dtype=np.uint8)
         # 255 where floor is seen, and the layer elsewhere: to lay the layer over backgrounds by bitwise operations.
@@ -210,12 +219,14 @@ class PointMazeVectorEnv(BatchEnv):
     def _reset_envs(self, indices: NDArray[np.int64]) -> None:
         self._physics.reset(indices, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         for i in indices:
-            corners, solid, start = sample_layout(self._generators[i])
-            self._obstacle_pos[i] = to_meters(corners + OBSTACLE_PIXELS / 2)
-            self._position[i] = start
+            layout = sample_layout(self._generators[i], self.goal)
+            solid, mark = layout.solid, goal_mask(layout.goal)
+            self._obstacle_pos[i] = to_meters(layout.corners + OBSTACLE_PIXELS / 2)
+            self._position[i] = layout.start
+            self._goals[i] = to_meters(np.array(layout.goal))
             self._solid_counts[i, 1:, 1:] = solid.cumsum(axis=0).cumsum(axis=1)
-            self._layers[i] = static_layer(solid)
-            self._floor[i] = np.where(solid | GOAL_MASK, 0, 255)
+            self._layers[i] = static_layer(solid, mark)
+            self._floor[i] = np.where(solid | mark, 0, 255)
             self._standing[i] = self._layers[i] & ~self._floor[i]
 
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -224,7 +235,8 @@ class PointMazeVectorEnv(BatchEnv):
             self._simulate(None, SUBSTEPS)
         else:
             self._move_from_rest(free_displacement(actions) if self.continuous else self._pushes[actions])
-        reached = np.hypot(self._position[:, 0], self._position[:, 1]) <= GOAL_RADIUS
+        away = self._position - self._goals
+        reached = np.hypot(away[:, 0], away[:, 1]) <= GOAL_RADIUS
         rewards = reached - 1.0 if self.reward_type == "step" else reached.astype(np.float64)
         return rewards, reached
 
@@ -304,7 +316,7 @@ class PointMazeVectorEnv(BatchEnv):
         factors = {
             "agent": self._position.astype(np.float32),
             "obstacles": self._obstacle_pos.astype(np.float32),
-            "goal": np.zeros((self.num_envs, 2), dtype=np.float32),
+            "goal": self._goals.astype(np.float32),
         }
         if self.momentum:
             factors["velocity"] = self._velocity.astype(np.float32)

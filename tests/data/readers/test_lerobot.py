@@ -311,4 +311,4 @@ def test_a_missing_package_names_the_command(
     monkeypatch.setattr(importlib, "import_module", without)
     with pytest.raises(SystemExit) as exit_info:
         main(["import", "lerobot", str(written), "-o", str(tmp_path / "d")])
-    assert exit_info.value.code == 2 and 'pip install "sb3_abisim[lerobot]"' in capsys.readouterr().err
+    assert exit_info.value.code == 2 and "pip install 'sb3_abisim[lerobot]'" in capsys.readouterr().err

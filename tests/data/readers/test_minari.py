@@ -393,4 +393,4 @@ def test_missing_minari_names_the_command_that_installs_it(
     with pytest.raises(SystemExit) as exit_info:
         main(["export", str(ours), "index-v0"])
     assert exit_info.value.code == 2
-    assert 'pip install "sb3_abisim[minari]"' in capsys.readouterr().err
+    assert "pip install 'sb3_abisim[minari]'" in capsys.readouterr().err

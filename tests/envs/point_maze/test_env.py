@@ -281,16 +281,33 @@ def test_success_is_within_one_meter(end: tuple[float, float], expected: bool) -
     assert env.step(np.array([LEFT]))[2][0] == expected
 
 
-def test_the_observation_shows_what_the_factors_are() -> None:
-    env = batch(20)
+@pytest.mark.parametrize(("end", "expected"), [((1.02, 0.0), False), ((0.98, 0.0), True), ((0.8, 0.8), False)])
+def test_success_is_at_the_goal_wherever_it_is(end: tuple[float, float], expected: bool) -> None:
+    env = batch(autoreset=False, goal="random")
+    goal = env.factors()["goal"][0]
+    assert np.hypot(*goal) > 1.0
+    place(env, (goal[0] + end[0] + 1.01072805, goal[1] + end[1]))
+    # No longer at the center.
+    _, rewards, terminated, *_ = env.step(np.array([LEFT]))
+    assert (rewards[0], terminated[0]) == ((0.0, True) if expected else (-1.0, False))
+    other = batch(autoreset=False, goal="random")
+    place(other, (0.5 + 1.01072805, 0.0))
+    assert not other.step(np.array([LEFT]))[2][0]
+
+
+@pytest.mark.parametrize("goal", ["center", "random"])
+def test_the_observation_shows_what_the_factors_are(goal: str) -> None:
+    env = batch(20, goal=goal)
     observations = env._observe(np.arange(20))
     factors = env.factors()
-    for observation, (x, y), obstacles in zip(observations, factors["agent"], factors["obstacles"], strict=True):
+    states = (factors[name] for name in ("agent", "obstacles", "goal"))
+    for observation, (x, y), obstacles, at in zip(observations, *states, strict=True):
         solid = solid_pixels(obstacles)
         walls = solid_pixels(np.zeros((0, 2)))
+        left, top = ((at + 8) * 4).astype(int) - 2
         expected = np.empty((64, 64, 3), dtype=np.uint8)
         expected[:] = top_down.FLOOR
-        expected[30:34, 30:34] = top_down.GOAL
+        expected[top : top + 4, left : left + 4] = top_down.GOAL
         expected[solid] = top_down.OBSTACLE
         expected[walls] = top_down.WALL
         column, row = (x + 8) * 4, (y + 8) * 4

@@ -9,11 +9,14 @@ from sb3_abisim.envs.point_maze import layout as point_maze_layout
 from sb3_abisim.envs.point_maze.env import PointMazeVectorEnv
 
 
-def reachable(solid: np.ndarray) -> np.ndarray:
-    """Top left pixels of the 0.5 m squares that slide to the goal over free floor, by depth-first search."""
+def reachable(solid: np.ndarray, goal: tuple[int, int] = (32, 32)) -> np.ndarray:
+    """Top left pixels of the 0.5 m squares that slide to the goal over free floor, by depth-first search.
+
+    :param goal: (row, column) of the corner between pixels
+    """
     free = ~(solid[:-1, :-1] | solid[1:, :-1] | solid[:-1, 1:] | solid[1:, 1:])
     seen = np.zeros_like(free)
-    stack = [(31, 31)]
+    stack = [(goal[0] - 1, goal[1] - 1)]
     while stack:
         row, column = stack.pop()
         if free[row, column] and not seen[row, column]:
@@ -61,6 +64,36 @@ def test_blocked_layouts_are_rejected_by_the_flood_fill() -> None:
 @pytest.mark.parametrize("seed", [217, 408, 419, 469])
 def test_blocked_layouts_are_sampled_again(seed: int) -> None:
     """One in a hundred is; the first of each of these seeds."""
-    _, solid, start = point_maze_layout.sample_layout(np.random.default_rng(seed))
-    column, row = point_maze_layout.to_pixels(start)
-    assert reachable(solid)[round(row) - 1, round(column) - 1]
+    layout = point_maze_layout.sample_layout(np.random.default_rng(seed))
+    column, row = point_maze_layout.to_pixels(layout.start)
+    assert reachable(layout.solid)[round(row) - 1, round(column) - 1] and layout.goal == (32, 32)
+
+
+def test_random_goals_lie_anywhere_inside_and_can_be_reached() -> None:
+    env = PointMazeVectorEnv(num_envs=400, goal="random")
+    observations, _ = env.reset(seed=0)
+    factors = env.factors()
+    goals, agents = factors["goal"], factors["agent"]
+    for observation, obstacles, agent, goal in zip(observations, factors["obstacles"], agents, goals, strict=True):
+        solid = solid_pixels(obstacles)
+        column, row = ((goal + 8) * 4).astype(int)
+        assert not solid[row - 4 : row + 4, column - 4 : column + 4].any(), "an obstacle around the goal, or a wall"
+        assert np.hypot(*(agent - goal)) > 1.0
+        mark = np.zeros((64, 64), dtype=bool)
+        mark[row - 2 : row + 2, column - 2 : column + 2] = True
+        # The agent's disc may lie over a corner of the mark.
+        green = (observation == np.array(point_maze_layout.top_down.GOAL)[:, None, None]).all(axis=0)
+        assert green.sum() >= 12 and not (green & ~mark).any()
+        at = (agent + 8) * 4
+        assert reachable(solid, (row, column))[round(at[1]) - 1, round(at[0]) - 1]
+    # In steps of a pixel, a quarter of a meter, uniform over 53 places along each axis.
+    assert goals.min() == -6.5 and goals.max() == 6.5 and np.array_equal(goals, np.round(goals * 4) / 4)
+    assert (np.abs(goals.mean(axis=0)) < 4 * 3.82 / 20).all() and abs(np.corrcoef(goals.T)[0, 1]) < 0.2
+    assert len(np.unique(goals, axis=0)) > 350
+
+
+def test_goals_in_the_corners() -> None:
+    env = PointMazeVectorEnv(num_envs=200, goal="corners")
+    env.reset(seed=0)
+    places, counts = np.unique(env.factors()["goal"], axis=0, return_counts=True)
+    assert places.tolist() == [[-3.5, -3.5], [-3.5, 3.5], [3.5, -3.5], [3.5, 3.5]] and counts.min() > 30
