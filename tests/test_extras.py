@@ -33,7 +33,11 @@ CALLS: dict[str, list[tuple[str, str]]] = {
         ("lerobot", "main(['data', 'import', 'lerobot', 'folder', '-o', 'new'])"),
     ],
     "h5py": [("minari", "main(['data', 'import', 'minari', 'a/b-v0', '-o', 'new'])")],
-    "huggingface_hub": [("hub", "main(['export', 'hf://owner/repository/file.safetensors', '-o', 'new.pt2'])")],
+    "huggingface_hub": [
+        ("hub", "main(['export', 'hf://owner/repository/file.safetensors', '-o', 'new.pt2'])"),
+        ("hub", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--no-evidence'])"),
+        ("hub", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--no-evidence', '-o', 'new'])"),
+    ],
     "jinja2": [("benchmark", "main(['benchmark', '-o', 'new'])")],
     "matplotlib": [
         ("plots", "main(['demo', '-o', 'new'])"),
@@ -52,6 +56,7 @@ CALLS: dict[str, list[tuple[str, str]]] = {
     "scipy": [
         ("scan", "gym.make('ScanNav-v0')"),
         ("benchmark", "main(['benchmark', 'report', 'run'])"),
+        ("benchmark", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--benchmark', 'run', '-o', 'new'])"),
     ],
     "sklearn": [
         ("analysis", "main(['analyze', 'probes', '--env', 'Nav2D-v0', 'Nav2D-v0/ssi', '-n', '20'])"),

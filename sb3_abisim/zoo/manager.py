@@ -37,7 +37,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
-from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
+from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError, resolve_encoder
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of

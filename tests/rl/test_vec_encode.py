@@ -14,7 +14,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 
 from sb3_abisim.networks import base as networks
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
 
 
