@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-lowest test-slow format lint type check docs bench figures comparisons benchmark benchmark-smoke clean
+.PHONY: help setup demo test test-lowest test-slow format lint type check docs bench reliability figures comparisons benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -59,9 +59,13 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_pretraining
 	$(BIN)/python -m benchmarks.bench_memory
 	$(BIN)/python -m benchmarks.bench_frozen
+	$(BIN)/python -m benchmarks.bench_auxiliary
 	$(BIN)/python -m benchmarks.bench_scan_nav
 	$(BIN)/python -m benchmarks.bench_malloc
 	$(BIN)/python -m benchmarks.bench_collect
+
+reliability: setup  ## damaged and hostile files, kills, steps and NaN, counted, into docs/limits.md; half an hour
+	$(BIN)/python -m benchmarks.reliability --seed 0
 
 figures: setup  ## make every figure of docs/figures.md again from the committed encoders; about a quarter of an hour
 	$(BIN)/sb3-abisim analyze all --images docs/images --numbers benchmarks/results
@@ -69,7 +73,7 @@ figures: setup  ## make every figure of docs/figures.md again from the committed
 # The folders of committed runs whose curves are in docs/results.md: of evaluations, and of training episodes.
 COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
 TRAINING_COMPARISONS := distractor_frozen_longer distractor_frozen_early distractor_frozen_7m distractor_finetuned_more \
-	nav2d_ppo_frozen distractor_frozen_layer
+	nav2d_ppo_frozen distractor_frozen_layer minigrid_fourrooms
 # Compared with the runs of nav2d_dqn_target.
 NAV2D_VANILLA := vanilla, 10,000=benchmarks/results/comparison/nav2d_dqn/runs/Nav2D-v0/vanilla-cd2b7a74
 

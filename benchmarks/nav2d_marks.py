@@ -1,4 +1,4 @@
-"""What an agent reaches on Nav2D that is told what encoders have to see: the upper marks of docs/results.md.
+"""What an agent reaches on Nav2D that is told what encoders have to see: the upper marks of docs/results_appendix.md.
 
 Importing this module registers two ids. Both have Nav2D's episodes, actions and rewards, and vectors as observations:
 

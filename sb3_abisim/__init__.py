@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from sb3_abisim.networks.from_module import from_module
     from sb3_abisim.objectives.base import Objective, TensorBatch
     from sb3_abisim.pretraining.pretrain import pretrain
+    from sb3_abisim.rl.auxiliary import AuxiliaryObjective
     from sb3_abisim.rl.callbacks import EncoderCallback
     from sb3_abisim.rl.combined import CombinedEncoderExtractor
     from sb3_abisim.rl.extractors import EncoderExtractor
@@ -46,6 +47,7 @@ _PUBLIC = {
     "CUT": "data.format",
     "TERMINATED": "data.format",
     "TRUNCATED": "data.format",
+    "AuxiliaryObjective": "rl.auxiliary",
     "BatchEnv": "envs.base",
     "BatchedVecEnv": "envs.sb3_vec_env",
     "CombinedEncoderExtractor": "rl.combined",
@@ -76,6 +78,7 @@ __all__ = [
     "CUT",
     "TERMINATED",
     "TRUNCATED",
+    "AuxiliaryObjective",
     "BatchEnv",
     "BatchedVecEnv",
     "CombinedEncoderExtractor",

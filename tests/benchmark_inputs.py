@@ -9,7 +9,8 @@ import numpy as np
 import yaml
 
 from sb3_abisim.registry import get_method
-from sb3_abisim.zoo.methods import ENCODING_WRAPPER, MethodRecord
+from sb3_abisim.zoo.entries import ENCODING_WRAPPER
+from sb3_abisim.zoo.method_record import MethodRecord
 
 STEPS = list(range(1000, 11_000, 1000))
 # The step at which a method jumps from -100 to -20, per seed; above the last step it never does.

@@ -26,9 +26,9 @@ MODULES = (
     "objectives.ssi", "objectives.acro", "objectives.info_nce", "objectives.beta_vae", "objectives.curl",
     "pretraining.pretrain", "pretraining.config", "pretraining.card", "rl.extractors", "rl.extractor_classes",
     "rl.task_features", "rl.augment", "rl.checks", "rl.vec_encode", "rl.merge", "rl.callbacks", "rl.fine_tuning",
-    "rl.critic_routing", "rl.optimizers",
-    "zoo.methods", "zoo.manager", "zoo.runs", "zoo.evaluate", "zoo.record", "analysis.exact_metric",
-    "analysis.nav2d_exact", "analysis.leak",
+    "rl.critic_routing", "rl.optimizers", "rl.auxiliary",
+    "zoo.entries", "zoo.methods", "zoo.method_record", "zoo.manager", "zoo.runs", "zoo.evaluate", "zoo.record",
+    "analysis.exact_metric", "analysis.nav2d_exact", "analysis.leak",
 )  # fmt: skip
 
 

@@ -17,7 +17,8 @@ from sb3_abisim.networks.encoder_name import pinned_name
 from sb3_abisim.pretraining.config import FOLLOWING, load_config
 from sb3_abisim.registry import get_method, get_objective, get_traits, methods
 from sb3_abisim.zoo.collect import preprocessing_entry
-from sb3_abisim.zoo.methods import MethodSpec, hyperparameters_entry
+from sb3_abisim.zoo.entries import hyperparameters_entry
+from sb3_abisim.zoo.methods import MethodSpec
 from sb3_abisim.zoo.preprocessing import check_preprocessing, items, normalizes_observations, other_vec_wrappers
 
 # What rl-zoo3 reads besides the algorithm's arguments, and what another flag sets.

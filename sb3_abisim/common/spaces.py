@@ -133,6 +133,24 @@ def fit_actions(actions: Any, space: gym.Space[Any], where: str) -> NDArray[Any]
     return array if dtype.kind == "f" else array.astype(dtype)
 
 
+def executed_actions(space: gym.Space[Any], stored: NDArray[Any], scaled: bool, clipped: bool) -> NDArray[Any]:
+    """The actions that the environments got, of those that Stable-Baselines3's buffers hold.
+
+    :param space: of one action
+    :param stored: (..., number of components)
+    :param scaled: whether those of a ``Box`` lie in -1..1, as off-policy algorithms store them
+    :param clipped: whether the environments got those of a ``Box`` clipped to its bounds, as on-policy algorithms do
+    :return: (..., *shape of an action)
+    """
+    stored = stored.reshape(*stored.shape[:-1], *(space.shape or ()))
+    if not isinstance(space, spaces.Box):
+        return stored
+    if scaled:
+        stored = space.low + 0.5 * (stored.astype(np.float64) + 1.0) * (space.high.astype(np.float64) - space.low)
+    # Rounding may lead out of the bounds.
+    return (np.clip(stored, space.low, space.high) if clipped or scaled else stored).astype(space.dtype)
+
+
 def _action_bounds(space: gym.Space[Any]) -> tuple[Any, Any]:
     """The smallest and the largest action, both in the space: numbers or arrays."""
     if isinstance(space, spaces.Discrete):

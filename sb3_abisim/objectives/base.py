@@ -67,6 +67,9 @@ class Objective(nn.Module):
     def prepare(self, observations: th.Tensor) -> None:
         """Called once, before the first update. What it decides is kept in buffers.
 
+        While RL runs, it is called again now and then where a base changes, with the same observations and the same
+        random numbers of torch, so that it decides the same.
+
         :param observations: from all over the data to train on, float (n, channels, height, width) in 0..1
         """
 

@@ -2,12 +2,9 @@
 
 import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
-from sb3_abisim.common.paths import resource_path
-from sb3_abisim.common.yaml_text import read_yaml_file
-from sb3_abisim.registry import get_method
+from sb3_abisim.common.method_settings import settings_entry
 
 # Batches of the eval split that a row of the log is the mean of.
 N_EVAL_BATCHES = 8
@@ -118,10 +115,7 @@ def load_config(objective: str, env_id: str, overrides: dict[str, Any] | None = 
         one entry of a nested setting
     :raises ValueError: for an unknown method or setting
     """
-    custom = get_method(objective).hyperparams
-    path = resource_path("hyperparams") / "pretrain" / f"{objective}.yml" if custom is None else Path(custom)
-    entries = read_yaml_file(path) if custom is not None or path.is_file() else {}
-    mapping = dict(entries.get(env_id, entries.get("default", {})))
+    _, mapping = settings_entry(objective, env_id)
     for name, value in (overrides or {}).items():
         outer, _, inner = name.partition(".")
         if inner and not isinstance(mapping.get(outer, {}), dict):

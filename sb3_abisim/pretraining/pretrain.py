@@ -68,6 +68,7 @@ def pretrain(
     from sb3_abisim.common.files import folder_lock, remove_temporaries
     from sb3_abisim.common.malloc import keep_freed_memory
     from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.data.image_warning import warn_of_images
     from sb3_abisim.networks.base import make_encoder
     from sb3_abisim.pretraining.card import refuse_to_replace
     from sb3_abisim.pretraining.trainer import PretrainRun, make_objective
@@ -89,6 +90,7 @@ def pretrain(
         config = load_config(objective, env_id, config)
     dataset = TransitionDataset(data, eval_fraction=config.eval_fraction)
     _check_parts(dataset, config)
+    warn_of_images(dataset, stacklevel=2)
     if base_method is not None and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
         # Mistakes in the settings of this objective are found before the base is trained.

@@ -31,6 +31,7 @@ from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
 from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.rl.augment import Augment
+from sb3_abisim.rl.auxiliary_state import AuxiliarySlot
 from sb3_abisim.rl.file_network import build_network, check_objective, read_network
 from sb3_abisim.rl.frozen_weights import buffers_to_parameters, parameters_to_buffers
 from sb3_abisim.rl.task_features import make_task_network
@@ -83,6 +84,7 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
         self.register_buffer("initial_weights", self._flat_weights().clone())
         self._input_checked = False
         self._image_check = ImageCheck()
+        self.auxiliary = AuxiliarySlot()
 
     @property
     def hash(self) -> str | None:
@@ -128,6 +130,14 @@ class BaseEncoderExtractor(BaseFeaturesExtractor):
                     "weights are, or are far too large; lower the learning rate, or look for NaN in rewards"
                 )
         return features
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        self.auxiliary.save(destination, prefix)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        self.auxiliary.load(state_dict, prefix)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     @property
     def extras(self) -> str:

@@ -10,9 +10,11 @@ import gymnasium as gym
 
 from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs
 from sb3_abisim.registry import is_import_path
+from sb3_abisim.zoo.auxiliary import GRAMMAR, parse_auxiliary
 from sb3_abisim.zoo.guard import GUARDED, guarded
 from sb3_abisim.zoo.manager import MethodExperimentManager
-from sb3_abisim.zoo.methods import grammar
+from sb3_abisim.zoo.methods import grammar, split_options
+from sb3_abisim.zoo.whole_files import saves_whole
 
 # The commands of rl-zoo3 by name: the module, and an example.
 SCRIPTS = {
@@ -28,7 +30,11 @@ _WITH_PACKAGES = ("train", "enjoy")
 # Reads a pickle that only it and its like write.
 _UNPICKLES = "plot_from_file"
 _TRUST = "--trust"
+# Before training has begun, they are mistakes of the command.
+_MISTAKES = (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error)
 _PACKAGES = ("--packages", "--gym-packages")
+_CONF_FILE = ("-conf", "--conf-file")
+_AUXILIARY = "--auxiliary"
 _PAIRS = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 
 
@@ -53,12 +59,14 @@ def main(argv: Sequence[str]) -> None:
     if {"-h", "--help"} & set(flags):
         if command == "train":
             print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
+            print(f"{_AUXILIARY} {GRAMMAR} trains the encoder by an objective, too: --auxiliary abisim:weight=0.5.")
         print("--packages MODULE ... imports modules that register environments, methods, networks or readers.")
-        if command in (*GUARDED, _UNPICKLES):
+        if command in (*GUARDED, _UNPICKLES, "train"):
             print(f"{_TRUST} opens the pickles of a run folder, which execute whatever they hold: for your own alone.")
         print(f"example: {prog} {example}\n")
     MethodExperimentManager.has_begun = False
     is_trusted = _TRUST in flags
+    MethodExperimentManager.builds_from_yaml = not is_trusted
     try:
         if command == _UNPICKLES and not is_trusted and not {"-h", "--help"} & set(flags):
             raise ValueError(
@@ -66,25 +74,46 @@ def main(argv: Sequence[str]) -> None:
             )
         words, packages = for_rl_zoo3([flag for flag in flags if flag != _TRUST])
         import_packages(packages)
+        if command == "train":
+            words = _with_auxiliary(words)
         modules = [name for name in packages if not is_import_path(name)]
         if modules and command in _WITH_PACKAGES:
             words += ["--gym-packages", *modules]
         sys.argv = [prog, *words]
         # rl_zoo3.plots imports its commands, which runpy would warn of.
         warnings.filterwarnings("ignore", "'rl_zoo3.plots", RuntimeWarning)
-        with guarded() if command in GUARDED and not is_trusted else contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            if command in GUARDED and not is_trusted:
+                stack.enter_context(guarded())
+            if command == "train":
+                stack.enter_context(saves_whole())
             runpy.run_module(module, run_name="__main__")
     except FloatingPointError as error:
-        # Training has stopped, and no model was saved.
+        # Training has stopped, and no final model was saved.
         print(f"{prog}: {one_line(error)}", file=sys.stderr)
         sys.exit(1)
-    except (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error) as error:
+    except Exception as error:
+        if MethodExperimentManager.has_begun and (system := _system_error(error)) is not None:
+            print(f"{prog}: {one_line(system)}; training has stopped", file=sys.stderr)
+            sys.exit(1)
+        if not isinstance(error, _MISTAKES):
+            raise
         # Of TypeErrors, an unknown hyperparameter or argument of an environment is a mistake of the command.
         is_mistake = not isinstance(error, TypeError) or "unexpected keyword argument" in str(error)
         if MethodExperimentManager.has_begun or not is_mistake:
             raise
         print(f"{prog}: error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
+    finally:
+        MethodExperimentManager.builds_from_yaml = False
+
+
+def _system_error(error: BaseException) -> OSError | None:
+    """What the system said, such as that a disk is full: it may lie beneath what a library made of it."""
+    below: BaseException | None = error
+    while below is not None and not isinstance(below, OSError):
+        below = below.__cause__ or below.__context__
+    return below
 
 
 def for_rl_zoo3(flags: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -115,6 +144,36 @@ def for_rl_zoo3(flags: Sequence[str]) -> tuple[list[str], list[str]]:
         else:
             words.append(value)
     return words, packages
+
+
+def _with_auxiliary(words: Sequence[str]) -> list[str]:
+    """``--auxiliary X`` as ``--conf-file ...,auxiliary=X``, which the run's folder then records.
+
+    :param words: flags in rl-zoo3's form
+    :raises ValueError: for one without its word, or two of them
+    """
+    rest: list[str] = []
+    found: dict[str, list[str]] = {_AUXILIARY: [], "--conf-file": []}
+    words = list(words)
+    while words:
+        word = words.pop(0)
+        option, equals, value = word.partition("=")
+        if option != _AUXILIARY and option not in _CONF_FILE:
+            rest.append(word)
+            continue
+        if not equals and not words:
+            raise ValueError(f"{option} takes a word, such as {_AUXILIARY} ssi")
+        found[_AUXILIARY if option == _AUXILIARY else "--conf-file"].append(value if equals else words.pop(0))
+    if len(found[_AUXILIARY]) > 1:
+        raise ValueError(f"{_AUXILIARY} is given twice, {' and '.join(found[_AUXILIARY])}; give one")
+    configs = found["--conf-file"][-1:]
+    for auxiliary in found[_AUXILIARY]:
+        config = configs[0] if configs else ""
+        if "auxiliary" in split_options(config)[1]:
+            raise ValueError(f"--conf-file {config} names an auxiliary objective already; leave {_AUXILIARY} out")
+        parse_auxiliary(auxiliary)
+        configs = [f"{config},auxiliary={auxiliary}"]
+    return rest + [word for config in configs for word in ("--conf-file", config)]
 
 
 def _pair(name: str, value: object, option: str) -> str:

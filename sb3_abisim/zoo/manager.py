@@ -10,6 +10,7 @@ For every environment:
 
 * ``--conf-file METHOD[=ENCODER][,frozen][,option=value]`` keeps the hyperparameters and replaces the features
   extractor; frozen and without options, it puts ``VecEncodeObservations`` in its place;
+* ``,auxiliary=OBJECTIVE`` behind any of these, a file or nothing adds an ``AuxiliaryObjective`` to the callbacks;
 * ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
 * a run's folder says in ``method.json`` what it used, and that of a run on a frozen encoder holds a copy of the file;
@@ -29,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -38,12 +40,10 @@ from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
 from sb3_abisim.networks.encoder_name import EncoderNotFoundError, resolve_encoder
 from sb3_abisim.registry import get_traits
-from sb3_abisim.rl.callbacks import EncoderCallback
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
-from sb3_abisim.zoo.methods import (
-    MethodRecord,
-    MethodSpec,
+from sb3_abisim.zoo.auxiliary import auxiliary_of, with_auxiliary
+from sb3_abisim.zoo.entries import (
     encoding_kwargs,
     hyperparameters_entry,
     hyperparameters_file,
@@ -52,8 +52,12 @@ from sb3_abisim.zoo.methods import (
     unfreezes,
     zoo_hyperparams,
 )
+from sb3_abisim.zoo.method_record import MethodRecord
+from sb3_abisim.zoo.methods import MethodSpec, split_options
+from sb3_abisim.zoo.models import continued_model, read_model_run
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
-from sb3_abisim.zoo.run_files import hash_run
+from sb3_abisim.zoo.run_files import MEANS_NAME, hash_run
+from sb3_abisim.zoo.saved_spaces import read_vec_normalize
 from sb3_abisim.zoo.spaces import check_replayed, check_spaces
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
@@ -69,7 +73,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     """``rl_zoo3.exp_manager.ExperimentManager`` that knows methods; parameters as there."""
 
     algo: str
-    callbacks: list[Any]
+    callbacks: list[BaseCallback]
     config: str
     custom_hyperparams: dict[str, Any] | None
     env_kwargs: dict[str, Any]
@@ -83,6 +87,8 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     _spec: MethodSpec | None = None
     # Whether a run of this process has begun to train: errors before that are mistakes of the command.
     has_begun = False
+    # Whether saved models are built from the YAML of their runs, so that no pickle is opened.
+    builds_from_yaml = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """As rl-zoo3 does, from our files and with a method's values.
@@ -91,8 +97,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         :raises ValueError: for an unknown method, or hyperparameters that do not fit together
         """
         env_id = self.env_name.gym_id
-        is_default = Path(self.config).parent == zoo_hyperparams()
-        self._spec = None if is_default else MethodSpec.of_conf_file(self.config)
+        self._spec = MethodSpec.of_conf_file(self.config)
+        self.config, options = split_options(self.config)
+        is_default = not self.config or Path(self.config).parent == zoo_hyperparams()
         if self.trial_id is not None and (self._spec is not None or env_id in ENV_IDS):
             raise ValueError(
                 "--trial-id would replace policy_kwargs, the encoder included (rl-zoo3#431); "
@@ -108,6 +115,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 replaced["policy"] = policy_of(self.algo, replaced["policy"])
             self.custom_hyperparams = {**custom, **replaced}
         hyperparams, saved_hyperparams = super().read_hyperparameters()
+        if "auxiliary" in options:
+            for each in (hyperparams, saved_hyperparams):
+                each["callback"] = with_auxiliary(each.get("callback"), options["auxiliary"])
         self._check_normalize(hyperparams)
         self._set_batched_vec_env(hyperparams)
         self._set_eval_env_kwargs(hyperparams)
@@ -210,6 +220,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                 self.params_path = f"{self.save_path}/{self.env_name}"
 
     def _make_record(self) -> MethodRecord:
+        return dataclasses.replace(self._record_encoder(), auxiliary=auxiliary_of(self._used))
+
+    def _record_encoder(self) -> MethodRecord:
         preprocessing = {key: self._used[key] for key in PREPROCESSING_KEYS if key in self._used}
         encoding = encoding_kwargs(self._used)
         if encoding is not None:
@@ -240,15 +253,12 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         )
 
     def learn(self, model: BaseAlgorithm) -> None:
-        """As rl-zoo3 does, once the encoder's callback agrees.
+        """As rl-zoo3 does.
 
         :param model: to train
-        :raises ValueError: for a model that its arguments are not for
         """
-        for callback in self.callbacks:
-            if isinstance(callback, EncoderCallback):
-                callback.check(model)
-        MethodExperimentManager.has_begun = True
+        # Behind all others, which look first whether they can do what they are asked to.
+        self.callbacks.append(_HasBegun())
         super().learn(model)
 
     def save_trained_model(self, model: BaseAlgorithm) -> None:
@@ -269,7 +279,11 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
         """Refuse ``-i`` with another extractor: rl-zoo3 keeps the model's, and would record the one asked for."""
         asked = hyperparams.get("policy_kwargs") or {}
-        model: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
+        try:
+            model = self._saved_agent(hyperparams, env)
+        except BaseException:
+            env.close()
+            raise
         try:
             check_trained_with(model, asked, unfreezes(self._used))
         except ValueError as error:
@@ -281,6 +295,38 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             self._record = dataclasses.replace(self._record, encoder_hash=extractor.hash)
         return model
 
+    def _saved_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
+        if not self.builds_from_yaml:
+            unpickled: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
+            return unpickled
+        path = Path(self.trained_agent)
+        buffer = path.with_name("replay_buffer.pkl")
+        if buffer.is_file():
+            raise ValueError(
+                f"{buffer} is a pickle, which executes whatever it holds; add --trust for yours, or move it elsewhere"
+            )
+        run = read_model_run(path)
+        if run.algo != self.algo:
+            raise ValueError(f"{path} is a model of {run.algo}, not {self.algo}; give --algo {run.algo}")
+        kept = {name: value for name, value in hyperparams.items() if name not in ("policy", "policy_kwargs")}
+        kept |= {"seed": self.seed, "tensorboard_log": self.tensorboard_log, "verbose": self.verbose}
+        return continued_model(path, run, env, self.device, kept)
+
+    def _maybe_normalize(self, env: Any, eval_env: bool) -> Any:
+        """As rl-zoo3 does; saved means are read by an unpickler that makes nothing else."""
+        path = Path(self.trained_agent).parent / self.env_name / MEANS_NAME
+        if not (self.builds_from_yaml and path.is_file()):
+            return super()._maybe_normalize(env, eval_env)
+        try:
+            normalize = read_vec_normalize(path)
+        except ValueError:
+            env.close()
+            raise
+        normalize.set_venv(env)
+        if eval_env:
+            normalize.training, normalize.norm_reward = False, False
+        return normalize
+
     def hyperparameters_optimization(self) -> None:
         """As rl-zoo3 does, except that an extractor of ours survives a trial's ``policy_kwargs``."""
         extractor = (self._hyperparams.get("policy_kwargs") or {}).get("features_extractor_class")
@@ -288,6 +334,16 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             self._hyperparams = _KeepExtractor(self._hyperparams)
         MethodExperimentManager.has_begun = True
         super().hyperparameters_optimization()
+
+
+class _HasBegun(BaseCallback):
+    """Notes that training has begun: errors from then on are no mistakes of the command."""
+
+    def _on_training_start(self) -> None:
+        MethodExperimentManager.has_begun = True
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class _KeepExtractor(dict[str, Any]):

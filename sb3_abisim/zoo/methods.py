@@ -1,33 +1,25 @@
-"""Methods: which features extractor a zoo run uses, as hyperparameters, and as the record that a run keeps of it."""
+"""Methods: which features extractor a zoo run uses, as a word of the command and as hyperparameters."""
 
 import contextlib
-import importlib
 import importlib.util
-import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-from sb3_abisim.common.files import write_atomic
-from sb3_abisim.common.paths import resource_path
-from sb3_abisim.common.yaml_text import read_yaml_file
 from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
 from sb3_abisim.networks.encoder_name import EncoderNotFoundError, pinned_name
 from sb3_abisim.registry import get_augmentation, get_method, methods
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
+from sb3_abisim.zoo.auxiliary import auxiliary_text, parse_auxiliary
+from sb3_abisim.zoo.entries import ENCODER_CALLBACK, ENCODING_WRAPPER
 from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_stack_of, items
 
-ENCODING_WRAPPER = "sb3_abisim.VecEncodeObservations"
-ENCODER_CALLBACK = "sb3_abisim.EncoderCallback"
-# Beside config.yml in a run's folder.
-RECORD_NAME = "method.json"
 # What may stand after a method as ",name=value", in this order, and the type of the value.
-_OPTIONS: dict[str, Callable[[str], Any]] = {"task_features_dim": int, "augment": str}
-# Of policy_kwargs: what a YAML names by its dotted path.
-_CLASS_KEYS = ("features_extractor_class", "optimizer_class", "activation_fn")
+_OPTIONS: dict[str, Callable[[str], Any]] = {"task_features_dim": int, "augment": str, "auxiliary": str}
+# Of these, what stands in the entry's callbacks and so behind a file, too; all others are arguments of the extractor.
+_CALLBACK_OPTIONS = ("auxiliary",)
 
 
 def grammar() -> str:
@@ -46,6 +38,7 @@ class MethodSpec:
     :param frozen: whether the weights stay as they are during RL
     :param task_features_dim: size of the trainable network beside the encoder, 0 for none
     :param augment: name of an augmentation; None for that of the method
+    :param auxiliary: objective that trains the encoder, too (:mod:`sb3_abisim.zoo.auxiliary`); None for none
     :raises ValueError: for an unknown method, or an encoder or ``frozen`` for an untrained one
     """
 
@@ -54,6 +47,7 @@ class MethodSpec:
     frozen: bool = False
     task_features_dim: int = 0
     augment: str | None = None
+    auxiliary: str | None = None
 
     def __post_init__(self) -> None:
         if self.name not in methods():
@@ -64,10 +58,22 @@ class MethodSpec:
             raise ValueError(f"task_features_dim must be at least 0, got {self.task_features_dim}; give {grammar()}")
         if self.augment is not None:
             get_augmentation(self.augment)
+        if self.auxiliary is not None:
+            self._check_auxiliary(self.auxiliary)
         if not get_method(self.name).has_encoder_file and (self.encoder is not None or self.frozen):
             raise ValueError(
                 f"{self.name!r} trains its network from scratch: it takes neither an encoder nor ',frozen'"
             )
+
+    def _check_auxiliary(self, text: str) -> None:
+        kwargs = parse_auxiliary(text)
+        if self.frozen and kwargs.get("weight") != 0:
+            raise ValueError(
+                f"',frozen' keeps the encoder as it is, and auxiliary={text} would train it; leave one of the two out, "
+                "or give weight=0, which measures only"
+            )
+        # The same settings in the same words: they decide which runs are alike.
+        object.__setattr__(self, "auxiliary", auxiliary_text(kwargs))
 
     @classmethod
     def parse(cls, text: str) -> "MethodSpec":
@@ -76,33 +82,29 @@ class MethodSpec:
         :param text: e.g. "ssi", "abisim,frozen,task_features_dim=64" or "abisim=runs/mine.safetensors"
         :raises ValueError: for anything else
         """
-        rest, given = text, dict[str, Any]()
-        # From the end: a path may hold commas and equals signs.
-        while match := re.fullmatch(rf"(.*),(?:(frozen)|({'|'.join(_OPTIONS)})=([^,]*))", rest):
-            rest, frozen, option, value = match.groups()
-            if (frozen or option) in given:
-                raise ValueError(f"{text!r} says {frozen or option} twice; give {grammar()}")
-            try:
-                given[frozen or option] = True if frozen else _OPTIONS[option](value)
-            except ValueError as error:
-                raise ValueError(f"{option} takes no {value!r} in {text!r}; give {grammar()}") from error
+        rest, given = split_options(text)
         head, equals, encoder = rest.partition("=")
         return cls(head, encoder if equals else None, **given)
 
     @property
     def options(self) -> dict[str, Any]:
         """What it says beyond method, encoder and ``frozen``, by name."""
-        return _given_options(self)
+        return given_options(self)
+
+    @property
+    def extractor_options(self) -> dict[str, Any]:
+        """Those of :attr:`options` that are arguments of the features extractor."""
+        return {name: value for name, value in self.options.items() if name not in _CALLBACK_OPTIONS}
 
     @property
     def suffix(self) -> str:
         """What stands behind method and encoder: ",frozen,task_features_dim=64"."""
-        return _suffix(self)
+        return suffix_of(self)
 
     @property
     def embeds_in_env(self) -> bool:
         """Whether ``VecEncodeObservations`` embeds each observation once: nothing else needs the observation."""
-        return self.frozen and not self.task_features_dim and not self.augment
+        return self.frozen and not self.options
 
     @classmethod
     def of_conf_file(cls, config: str) -> "MethodSpec | None":
@@ -113,8 +115,16 @@ class MethodSpec:
         """
         if re.split("[=,]", config)[0] in methods():
             return cls.parse(config)
+        config, given = split_options(config)
+        others = [name for name in given if name not in _CALLBACK_OPTIONS]
+        if others:
+            raise ValueError(f"--conf-file {config!r} is no method, which {', '.join(others)} need; give {grammar()}")
         module = config.partition(".")[0]
-        if not config.endswith((".yml", ".yaml", ".py")) and not (module and importlib.util.find_spec(module)):
+        if (
+            config
+            and not config.endswith((".yml", ".yaml", ".py"))
+            and not (module and importlib.util.find_spec(module))
+        ):
             raise ValueError(
                 f"--conf-file {config!r} is no YAML or Python file, module or method; a method is {grammar()}"
             )
@@ -174,10 +184,10 @@ class MethodSpec:
             check_objective(file, self.name)
             replaced["features_extractor_class"] = f"sb3_abisim.{CombinedEncoderExtractor.__name__}"
             arguments = {"encoders": {key: self._encoder(shipped)}, "networks": {key: stored_network(file)}}
-            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen, **self.options}
+            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen, **self.extractor_options}
         elif not self.embeds_in_env:
             replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
-            arguments = self.options
+            arguments = self.extractor_options
             if method.has_encoder_file:
                 network = {} if file is None else network_arguments(file)
                 frozen = {"freeze": True} if self.frozen else {}
@@ -224,193 +234,41 @@ class MethodSpec:
         return replaced
 
 
-@dataclass(frozen=True)
-class MethodRecord:
-    """What a run used, written beside its configuration as JSON; reports read it.
+def split_options(text: str) -> tuple[str, dict[str, Any]]:
+    """What stands before ``,frozen`` and ``,option=value`` in the word after ``--conf-file``, and these.
 
-    :param method: a registered name; None for a features extractor of no method
-    :param frozen: whether the weights stayed as they were
-    :param encoder: path or name of the encoder file; None without one
-    :param encoder_hash: sha256 of the encoder file; None without one
-    :param preprocessing: hyperparameters that stand between the environment and the encoder, where they are given
-    :param task_features_dim: size of the trainable network beside the encoder, 0 for none
-    :param augment: name of an augmentation; None for that of the method
+    :param text: e.g. "abisim=mine.safetensors,frozen", "mine.yml,auxiliary=ssi"
+    :raises ValueError: for an option that is given twice, or a value that is none of its
     """
-
-    method: str | None
-    frozen: bool
-    encoder: str | None
-    encoder_hash: str | None
-    preprocessing: dict[str, Any]
-    task_features_dim: int = 0
-    augment: str | None = None
-
-    @property
-    def label(self) -> str | None:
-        """What reports call it: "abisim", "abisim,frozen,task_features_dim=64"; None for no method."""
-        return None if self.method is None else self.method + _suffix(self)
-
-    def write(self, folder: str | Path) -> None:
-        """Write it into the folder of ``config.yml``.
-
-        :param folder: exists
-        """
-        # Wrappers of a Python configuration may be classes.
-        text = json.dumps(asdict(self), indent=1, sort_keys=True, default=str) + "\n"
-        write_atomic(Path(folder) / RECORD_NAME, lambda file: file.write(text.encode()))
-
-    @classmethod
-    def read(cls, folder: str | Path) -> "MethodRecord | None":
-        """Read it; None where there is none, as in runs of plain rl-zoo3.
-
-        :param folder: of ``config.yml``
-        :raises ValueError: for a damaged file
-        """
-        path = Path(folder) / RECORD_NAME
-        if not path.is_file():
-            return None
+    rest, given = text, dict[str, Any]()
+    # From the end: a path may hold commas and equals signs, and so may a value.
+    while match := re.fullmatch(rf"(.*),(?:(frozen)|({'|'.join(_OPTIONS)})=(.*))", rest):
+        rest, frozen, option, value = match.groups()
+        if (frozen or option) in given:
+            raise ValueError(f"{text!r} says {frozen or option} twice; give {grammar()}")
         try:
-            record = cls(**json.loads(path.read_bytes()))
-            texts = record.method, record.encoder, record.encoder_hash, record.augment
-            if not all(value is None or (isinstance(value, str) and value.isprintable()) for value in texts):
-                raise TypeError("a name is no text")
-            if not isinstance(record.frozen, bool) or not isinstance(record.preprocessing, dict):
-                raise TypeError("frozen is no bool, or preprocessing no mapping")
-            if type(record.task_features_dim) is not int:
-                raise TypeError("task_features_dim is no whole number")
-            return record
-        except (ValueError, TypeError, RecursionError) as error:
-            raise ValueError(f"{path} is damaged ({error}); leave the run out, or copy the file again") from error
+            given[frozen or option] = True if frozen else _OPTIONS[option](value)
+        except ValueError as error:
+            raise ValueError(f"{option} takes no {value!r} in {text!r}; give {grammar()}") from error
+    return rest, given
 
 
-def _given_options(given: MethodSpec | MethodRecord) -> dict[str, Any]:
+def given_options(given: Any) -> dict[str, Any]:
+    """The options that are given, by name.
+
+    :param given: has each as an attribute, which is false where it is not given
+    """
     return {name: value for name in _OPTIONS if (value := getattr(given, name))}
 
 
-def _suffix(given: MethodSpec | MethodRecord) -> str:
-    return ",frozen" * given.frozen + "".join(f",{name}={value}" for name, value in _given_options(given).items())
+def suffix_of(given: Any) -> str:
+    """What stands behind method and encoder: ",frozen,task_features_dim=64".
 
-
-def hyperparameters_file(algo: str, env_id: str) -> Path | None:
-    """The YAML file of this package with hyperparameters of an algorithm for an environment.
-
-    :param algo: rl-zoo3's name of the algorithm, e.g. "ppo"
-    :param env_id: any id
-    :return: None for an environment that is in none of the files
-    :raises ValueError: when only other algorithms have some, naming these
+    :param given: see :func:`given_options`; and ``frozen``
     """
-    files = [path for path in sorted(resource_path("hyperparams").glob("*.yml")) if env_id in read_entries(path)]
-    for path in files:
-        if path.stem == algo:
-            return path
-    if not files:
-        return None
-    known = ", ".join(path.stem for path in files)
-    raise ValueError(
-        f"sb3_abisim has no hyperparameters of {algo} for {env_id}, only of: {known}; "
-        "choose one of these with --algo, or give a custom YAML file with --conf-file"
+    return (",frozen" if given.frozen else "") + "".join(
+        f",{name}={value}" for name, value in given_options(given).items()
     )
-
-
-def hyperparameters_entry(algo: str, env_id: str) -> dict[str, Any]:
-    """The hyperparameters of an algorithm for an environment: this package's, else rl-zoo3's own.
-
-    :param algo: rl-zoo3's name of the algorithm
-    :param env_id: a registered id
-    :raises ValueError: when there are none
-    """
-    path = hyperparameters_file(algo, env_id)
-    if path is not None:
-        return dict(read_entries(path)[env_id])
-    exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
-    path = zoo_hyperparams() / f"{algo}.yml"
-    entries = read_entries(path) if path.is_file() else {}
-    key = "atari" if exp_manager.ExperimentManager.is_atari(env_id) else "default"
-    # As there: no default for Atari.
-    for name in (env_id, key):
-        if name in entries:
-            return dict(entries[name])
-    raise ValueError(f"rl-zoo3 has no hyperparameters of {algo} for {env_id}; choose another with --algo")
-
-
-def policy_of(algo: str, policy: str) -> str:
-    """The algorithm's policy of a kind, which rl-zoo3's default entry for RecurrentPPO calls as PPO does.
-
-    :param algo: rl-zoo3's name of the algorithm
-    :param policy: such as "MlpPolicy", or the dotted path of a custom one
-    :return: such as "MlpLstmPolicy"
-    :raises ValueError: when there is none
-    """
-    from rl_zoo3.utils import ALGOS  # type: ignore[import-untyped, unused-ignore]
-
-    known = ALGOS[algo].policy_aliases
-    if "." in policy or policy in known:
-        return policy
-    kind = re.match("Cnn|Mlp|MultiInput", policy)
-    found = [name for name in known if kind is not None and name.startswith(kind[0])]
-    if len(found) != 1:
-        raise ValueError(f"{algo} has no policy {policy!r}, only {', '.join(known)}; choose another with --algo")
-    return str(found[0])
-
-
-def zoo_hyperparams() -> Path:
-    """The folder of rl-zoo3's own hyperparameters."""
-    module: Any = importlib.import_module("rl_zoo3")
-    return Path(module.__file__).parent / "hyperparams"
-
-
-def read_entries(path: Path) -> dict[str, Any]:
-    """The entries of a zoo YAML by environment id; empty for a file of another form.
-
-    :param path: the file
-    """
-    content = read_yaml_file(path)
-    return content if isinstance(content, dict) else {}
-
-
-def resolve_classes(policy_kwargs: Any) -> Any:
-    """Import what ``policy_kwargs`` name by a dotted path, such as ``activation_fn: torch.nn.ReLU``.
-
-    :param policy_kwargs: of a zoo entry, a mapping; anything else is returned as it is
-    :return: a new dictionary
-    :raises ValueError: for a path that cannot be imported
-    """
-    if not isinstance(policy_kwargs, Mapping):
-        return policy_kwargs
-    kwargs = dict(policy_kwargs)
-    for key in _CLASS_KEYS:
-        if isinstance(kwargs.get(key), str):
-            module, _, name = kwargs[key].rpartition(".")
-            try:
-                kwargs[key] = getattr(importlib.import_module(module), name)
-            except (ImportError, AttributeError, ValueError) as error:
-                raise ValueError(
-                    f"policy_kwargs: cannot import {key} {kwargs[key]!r} ({error}); give its dotted path"
-                ) from error
-    return kwargs
-
-
-def encoding_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The arguments of ``VecEncodeObservations`` in a zoo entry, None where it is not used.
-
-    :param hyperparams: of a zoo entry, or of a run's ``config.yml``
-    """
-    for wrapper in items(hyperparams.get("vec_env_wrapper")):
-        if isinstance(wrapper, dict) and class_name(wrapper) == ENCODING_WRAPPER.rpartition(".")[2]:
-            kwargs: dict[str, Any] = next(iter(wrapper.values()))
-            return kwargs
-    return None
-
-
-def unfreezes(hyperparams: Mapping[str, Any]) -> bool:
-    """Whether the ``EncoderCallback`` of a zoo entry unfreezes a frozen encoder at some step.
-
-    :param hyperparams: of a zoo entry, or of a run's ``config.yml``
-    """
-    for item in items(hyperparams.get("callback")):
-        if isinstance(item, Mapping) and class_name(item) == ENCODER_CALLBACK.rpartition(".")[2]:
-            return (next(iter(item.values())) or {}).get("unfreeze_at") is not None
-    return False
 
 
 def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from sb3_abisim.common.hashes import check_hashes
 from sb3_abisim.common.vocabulary import current_result
-from sb3_abisim.zoo.methods import MethodRecord, encoding_kwargs
+from sb3_abisim.zoo.entries import encoding_kwargs
+from sb3_abisim.zoo.method_record import MethodRecord
 from sb3_abisim.zoo.run_files import (
     TRAINING_CURVE,
     Curve,

@@ -17,7 +17,7 @@ from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.data.format import META_NAME
 from sb3_abisim.data.vectorized import VectorizedCopies
 from sb3_abisim.networks.encoder_file import EncoderFile
-from sb3_abisim.zoo.methods import check_preprocessing
+from sb3_abisim.zoo.preprocessing import check_preprocessing
 
 N_ENVS, PER_SHARD = 3, 12
 

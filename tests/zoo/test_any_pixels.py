@@ -12,7 +12,7 @@ from zoo_inputs import SMALL, run
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.checks import find_extractors
 from sb3_abisim.zoo.evaluate import evaluate_final
-from sb3_abisim.zoo.methods import MethodRecord
+from sb3_abisim.zoo.method_record import MethodRecord
 from sb3_abisim.zoo.record import record
 from sb3_abisim.zoo.run_envs import final_model
 from sb3_abisim.zoo.runs import read_run

@@ -25,8 +25,9 @@ from sb3_abisim.rl.checks import check_trained_with, find_extractors
 from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.extractors import VanillaExtractor
 from sb3_abisim.rl.file_network import network_arguments
+from sb3_abisim.zoo.entries import ENCODING_WRAPPER, encoding_kwargs, read_entries
 from sb3_abisim.zoo.manager import MethodExperimentManager, install, with_eval_split
-from sb3_abisim.zoo.methods import ENCODING_WRAPPER, MethodRecord, encoding_kwargs, read_entries
+from sb3_abisim.zoo.method_record import MethodRecord
 from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.runs import read_run
 

@@ -1,26 +1,15 @@
-"""Method specs as hyperparameters, and the record that a run keeps of its method."""
+"""Method specs, and what they make of hyperparameters."""
 
-import json
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import pytest
 import torch as th
-from gymnasium.envs.registration import EnvSpec
 from torch import nn
 from zoo_inputs import write_encoder
 
-from sb3_abisim.rl.extractor_classes import extractor_class
-from sb3_abisim.zoo.methods import (
-    ENCODER_CALLBACK,
-    ENCODING_WRAPPER,
-    MethodRecord,
-    MethodSpec,
-    encoding_kwargs,
-    hyperparameters_entry,
-    resolve_classes,
-)
+from sb3_abisim.zoo.entries import ENCODER_CALLBACK, ENCODING_WRAPPER
+from sb3_abisim.zoo.methods import MethodSpec
 
 
 def test_method_specs() -> None:
@@ -183,70 +172,3 @@ def test_a_file_with_another_network_names_it(tmp_path: Path) -> None:
     assert MethodSpec("ssi", str(path)).policy_kwargs({})["features_extractor_kwargs"] == {"encoder": str(path)}
     # The random numbers of the run do not depend on the look-up.
     assert th.equal(th.random.get_rng_state(), state)
-
-
-def test_classes_by_dotted_path() -> None:
-    kwargs = {
-        "features_extractor_class": "sb3_abisim.SSIExtractor",
-        "activation_fn": "torch.nn.ReLU",
-        "optimizer_class": "torch.optim.AdamW",
-        "net_arch": {"pi": [7]},
-    }
-    before = dict(kwargs)
-    assert resolve_classes(kwargs) == {
-        "features_extractor_class": extractor_class("ssi"),
-        "activation_fn": nn.ReLU,
-        "optimizer_class": th.optim.AdamW,
-        "net_arch": {"pi": [7]},
-    }
-    assert kwargs == before
-    assert resolve_classes({"activation_fn": nn.Tanh}) == {"activation_fn": nn.Tanh}
-    assert resolve_classes(None) is None
-    for path in ("ReLU", "nn.ReLU", "torch.nn.RELU", "sb3_abisim.NobodysExtractor", ""):
-        with pytest.raises(ValueError, match=f"cannot import activation_fn '{path}' .*give its dotted path"):
-            resolve_classes({"activation_fn": path})
-
-
-def test_arguments_of_the_encoding_wrapper() -> None:
-    for wrapper in (ENCODING_WRAPPER, "sb3_abisim.rl.vec_encode.VecEncodeObservations"):
-        entry = {wrapper: {"encoder": "e"}}
-        assert encoding_kwargs({"vec_env_wrapper": [{"some.Wrapper": {}}, "other.Wrapper", entry]}) == {"encoder": "e"}
-        assert encoding_kwargs({"vec_env_wrapper": entry}) == {"encoder": "e"}
-    for none in ({}, {"vec_env_wrapper": None}, {"vec_env_wrapper": ["some.Wrapper"]}):
-        assert encoding_kwargs(none) is None
-
-
-# Of the records that were written before there were options.
-KEYS = "method", "frozen", "encoder", "encoder_hash", "preprocessing"
-
-
-def test_records(tmp_path: Path) -> None:
-    assert MethodRecord.read(tmp_path) is None
-    record = MethodRecord("ssi", True, "e", "0" * 64, {"frame_stack": 4, "env_wrapper": [nn.Module]})
-    record.write(tmp_path)
-    document = json.loads((tmp_path / "method.json").read_text())
-    assert document["preprocessing"]["env_wrapper"] == [str(nn.Module)]
-    read = MethodRecord.read(tmp_path)
-    assert read is not None and (read.label, read.encoder_hash) == ("ssi,frozen", "0" * 64)
-    assert MethodRecord("ssi", False, "e", None, {}).label == "ssi"
-    assert MethodRecord(None, False, None, None, {}).label is None
-    more = MethodRecord("ssi", True, "e", None, {}, 8, "random_crop")
-    more.write(tmp_path)
-    assert MethodRecord.read(tmp_path) == more and more.label == "ssi,frozen,task_features_dim=8,augment=random_crop"
-    # As those of before are.
-    (tmp_path / "method.json").write_text(json.dumps({key: document[key] for key in list(document) if key in KEYS}))
-    before = MethodRecord.read(tmp_path)
-    assert before is not None and before.label == "ssi,frozen"
-    wrong = [json.dumps({**document, **more}) for more in ({"more": 1}, {"task_features_dim": "8"}, {"augment": 1})]
-    for text in ("{", "[]", "{}", *wrong):
-        (tmp_path / "method.json").write_text(text)
-        with pytest.raises(ValueError, match=r"method\.json is damaged .*leave the run out"):
-            MethodRecord.read(tmp_path)
-
-
-def test_no_default_stands_for_atari(monkeypatch: pytest.MonkeyPatch) -> None:
-    """rl-zoo3 looks for an entry of Atari alone, and fails with a KeyError where an algorithm has none."""
-    monkeypatch.setitem(gym.registry, "ALE/Toy-v5", EnvSpec("ALE/Toy-v5", "ale_py.env:AtariEnv"))
-    assert hyperparameters_entry("ppo", "ALE/Toy-v5")["frame_stack"] == 4
-    with pytest.raises(ValueError, match="no hyperparameters of trpo for ALE/Toy-v5; choose another with --algo"):
-        hyperparameters_entry("trpo", "ALE/Toy-v5")

@@ -18,8 +18,8 @@ from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.checks import find_extractors
 from sb3_abisim.rl.extractor_classes import extractor_class
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
+from sb3_abisim.zoo.entries import encoding_kwargs
 from sb3_abisim.zoo.evaluate import evaluate_final
-from sb3_abisim.zoo.methods import encoding_kwargs
 from sb3_abisim.zoo.runs import read_run
 
 ExperimentManager: Any = importlib.import_module("rl_zoo3.exp_manager").ExperimentManager
@@ -145,6 +145,7 @@ def test_train_enjoy_and_evaluate(
         "preprocessing": {},
         "task_features_dim": 0,
         "augment": None,
+        "auxiliary": None,
     }
     assert read_run(folder).label == "ssi" + ",frozen" * (kind == "frozen")
     assert len(np.load(folder / "evaluations.npz")["timesteps"]) == 2

@@ -139,17 +139,20 @@ def _run(root: Path, work: Path, job: dict[str, Any]) -> None:
         damaged = output.with_suffix(".damaged")
         output.rename(damaged)
         print(f"{output} is not as it was made; it is now {damaged}", flush=True)
-    start, source = time.monotonic(), source_hash(job["kind"])
+    start, used, source = time.monotonic(), os.times(), source_hash(job["kind"])
     print(f"$ {command_line(job['command'])}", flush=True)
     code = subprocess.run([sys.executable, "-m", *job["command"]], stdin=subprocess.DEVNULL).returncode
     if code:
         sys.exit(code if code > 0 else 1)
+    spent = os.times()
     # Like its model, rl-zoo3 names the folder by the id with "-" for "/".
     made = next(work.glob(f"*/{Path(job['output_file']).stem}_1")) if job["kind"] == "run" else output
     content = {
         **job,
         "hash": file_hash(made / job["output_file"]),
         "seconds": round(time.monotonic() - start, 1),
+        # Of the command and all that it waited for: it says more where other programs run beside it.
+        "processor_seconds": round(sum(spent[2:4]) - sum(used[2:4]), 2),
         "source": source,
         "host": socket.gethostname(),
         "versions": {"sb3_abisim": __version__, "python": platform.python_version(), **_versions()},

@@ -42,6 +42,19 @@ class Group:
         """Returns as shares of the way from ``low`` to ``high``."""
         return (returns - self.low) / (self.high - self.low)
 
+    def level(self, share: float) -> float:
+        """The return of a normalized one."""
+        return self.low + share * (self.high - self.low)
+
+    @property
+    def horizon(self) -> int:
+        """Up to which step all runs go."""
+        return int(min(curve.steps[-1] for curve in self.curves))
+
+    def steps_to(self, level: float) -> Floats:
+        """Steps of each run to a return; NaN where it is not reached up to the horizon."""
+        return np.array([statistics.steps_to_threshold(c.steps, c.returns, level, self.horizon) for c in self.curves])
+
     def last(self) -> tuple[str, Floats]:
         """Return of each final model with the deterministic policy.
 

@@ -20,7 +20,7 @@ from sb3_abisim.registry import get_traits, methods
 from sb3_abisim.zoo.runs import Run, is_deterministic
 
 # Each a table, a figure or both, where there are numbers for it.
-PARTS = ("curves", "final", "thresholds", "splits", "aggregates", "profiles", "improvement")
+PARTS = ("curves", "final", "thresholds", "times", "splits", "aggregates", "profiles", "improvement")
 BOUND_SIGNS = {"": "", "<=": "≤ ", ">=": "≥ ", "~": "≈ "}
 
 
@@ -88,6 +88,7 @@ def render(comparison: Comparison, images: dict[str, bytes]) -> str:
         "place": _place,
         "plus_minus": _plus_minus,
         "ratio": _ratio,
+        "minutes": _minutes,
     }
     template = environment.from_string(resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
     sources = {name: f"data:image/png;base64,{base64.b64encode(data).decode()}" for name, data in images.items()}
@@ -101,6 +102,7 @@ def render(comparison: Comparison, images: dict[str, bytes]) -> str:
         cards=[_card(comparison, env_id) for env_id in comparison.groups],
         thresholds=[row for row in comparison.thresholds if (row["env_id"], row["threshold"]) not in unreached_keys],
         unreached=unreached,
+        times=[row for row in comparison.times if row["n_reached"]],
         final=_final_table(comparison),
         splits=_split_table(comparison),
         split_names=list(dict.fromkeys(s for env_id in comparison.groups for s in split_order(comparison, env_id))),
@@ -234,3 +236,8 @@ def _ratio(row: Row) -> str:
         return "not reached"
     text = f"{BOUND_SIGNS[row['bound']]}{row['ratio']:.2f}"
     return f"{text} [{row['low']:.2f}, {row['high']:.2f}]" if math.isfinite(row["low"]) else text
+
+
+def _minutes(row: Row) -> str:
+    text = f"{BOUND_SIGNS[row['bound']]}{row['minutes']:.1f}"
+    return f"{text} [{row['low']:.1f}, {row['high']:.1f}]" if math.isfinite(row["low"]) else text

@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from sb3_abisim.benchmark.report import statistics
 from sb3_abisim.benchmark.report.groups import Group, group_runs, labeled_runs, missing_notes
 from sb3_abisim.benchmark.report.statistics import Floats
+from sb3_abisim.benchmark.report.times import run_time
 
 # "Final Performance Evaluation", (mean, what follows +-) of the return; the paper does not say what the latter is.
 PAPER = {
@@ -41,6 +42,8 @@ class Comparison:
     :param curves: rows env_id, method, steps, mean, low, high, n_runs
     :param final: rows env_id, method, mode, split, mean, half_width, n_runs, paper
     :param thresholds: rows env_id, threshold, return, baseline, ratio, low, high, bound, reached_*, n_*
+    :param times: rows env_id, threshold, return, method, minutes, low, high, minutes_before, bound, n_reached, n_runs;
+        empty where no run is a job of a benchmark
     :param aggregates: rows score, method, iqm, low, high
     :param profiles: rows method, score, share, low, high
     :param improvement: rows baseline, probability, low, high
@@ -53,6 +56,7 @@ class Comparison:
     curves: list[Row]
     final: list[Row]
     thresholds: list[Row]
+    times: list[Row]
     aggregates: list[Row]
     profiles: list[Row]
     improvement: list[Row]
@@ -100,7 +104,8 @@ def compare(
     aggregates, profiles, improvement = _across(groups, labels, reference, seed, notes)
     return Comparison(
         groups, reference, source, _curve_rows(groups), _final_rows(groups, notes),
-        _threshold_rows(groups, reference, thresholds, seed, notes), aggregates, profiles, improvement, notes,
+        _threshold_rows(groups, reference, thresholds, seed, notes),
+        _time_rows(groups, reference, thresholds), aggregates, profiles, improvement, notes,
     )  # fmt: skip
 
 
@@ -145,43 +150,79 @@ def _threshold_rows(
     groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float | str], seed: int, notes: list[str]
 ) -> list[Row]:
     rows = []
+    for env_id, threshold, level in _levels(groups, reference, thresholds):
+        methods = groups[env_id]
+        if isinstance(threshold, str) and methods[threshold].normalized(level) < NEAR_THE_LOWEST:
+            notes.append(
+                f"{env_id}: {threshold} ends near the lowest return ({level:.4g}), which takes little to reach."
+            )
+        steps = {label: group.steps_to(level) for label, group in methods.items()}
+        for label in methods:
+            if label == reference:
+                continue
+            pair = methods[reference].horizon, methods[label].horizon
+            ratio = statistics.steps_ratio(steps[reference], steps[label], pair, seed)
+            rows.append(
+                {"env_id": env_id, "threshold": threshold, "return": level, "baseline": label,
+                 "ratio": ratio.value, "low": ratio.low, "high": ratio.high, "bound": ratio.bound,
+                 "steps_reference": ratio.steps[0], "steps_baseline": ratio.steps[1],
+                 "reached_reference": int((~np.isnan(steps[reference])).sum()),
+                 "reached_baseline": int((~np.isnan(steps[label])).sum()),
+                 "n_reference": len(steps[reference]), "n_baseline": len(steps[label]),
+                 "horizon_reference": pair[0], "horizon_baseline": pair[1]}
+            )  # fmt: skip
+    return rows
+
+
+def _levels(
+    groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float | str]
+) -> Iterator[tuple[str, float | str, float]]:
+    """Environment, threshold, and the return that it stands for."""
     for env_id, methods in groups.items():
         if reference not in methods:
             continue
-        horizons = {label: int(min(c.steps[-1] for c in group.curves)) for label, group in methods.items()}
         for threshold in thresholds:
-            if isinstance(threshold, str):
-                if threshold not in methods:
-                    continue
-                level = methods[threshold].end()
-                if methods[threshold].normalized(level) < NEAR_THE_LOWEST:
-                    notes.append(
-                        f"{env_id}: {threshold} ends near the lowest return ({level:.4g}), which takes little to reach."
-                    )
-            else:
-                first = methods[reference]
-                level = first.low + threshold * (first.high - first.low)
-            steps = {
-                label: np.array(
-                    [statistics.steps_to_threshold(c.steps, c.returns, level, horizons[label]) for c in group.curves]
-                )
-                for label, group in methods.items()
-            }
-            for label in methods:
-                if label == reference:
-                    continue
-                pair = horizons[reference], horizons[label]
-                ratio = statistics.steps_ratio(steps[reference], steps[label], pair, seed)
-                rows.append(
-                    {"env_id": env_id, "threshold": threshold, "return": level, "baseline": label,
-                     "ratio": ratio.value, "low": ratio.low, "high": ratio.high, "bound": ratio.bound,
-                     "steps_reference": ratio.steps[0], "steps_baseline": ratio.steps[1],
-                     "reached_reference": int((~np.isnan(steps[reference])).sum()),
-                     "reached_baseline": int((~np.isnan(steps[label])).sum()),
-                     "n_reference": len(steps[reference]), "n_baseline": len(steps[label]),
-                     "horizon_reference": pair[0], "horizon_baseline": pair[1]}
-                )  # fmt: skip
+            if not isinstance(threshold, str):
+                yield env_id, threshold, methods[reference].level(threshold)
+            elif threshold in methods:
+                yield env_id, threshold, methods[threshold].end()
+
+
+def _time_rows(groups: dict[str, dict[str, Group]], reference: str, thresholds: Sequence[float | str]) -> list[Row]:
+    """Wall-clock from nothing to a threshold, of methods whose collection and pretraining the benchmark did, too."""
+    rows = []
+    for env_id, threshold, level in _levels(groups, reference, thresholds):
+        for label, group in groups[env_id].items():
+            found = time_to(group, level)
+            if found is not None:
+                rows.append({"env_id": env_id, "threshold": threshold, "return": level, "method": label, **found})
     return rows
+
+
+def time_to(group: Group, level: float, clock: str = "seconds") -> Row | None:
+    """Time from nothing to a return: collection, pretraining, and the share of the run's time that its steps make.
+
+    Collection and base are counted in each run, although a benchmark makes them once for many.
+
+    :param group: runs of a benchmark, or of an export
+    :param level: the return
+    :param clock: "seconds" or "processor_seconds"
+    :return: minutes (mean), low and high (95 % interval), minutes_before (collection and pretraining), bound (">="
+        where runs did not reach it, which count whole), n_reached, n_runs; None where manifests lack it for a run
+    """
+    times = [run_time(run, clock) for run in group.runs]
+    if any(time is None or time.before is None for time in times):
+        return None
+    before = np.array([time.before for time in times if time is not None], dtype=np.float64) / 60
+    rl = np.array([time.rl for time in times if time is not None]) / 60
+    steps = group.steps_to(level)
+    last = np.array([curve.steps[-1] for curve in group.curves])
+    mean, half = statistics.mean_and_interval((before + rl * np.nan_to_num(steps / last, nan=1.0))[:, None])
+    return {
+        "minutes": float(mean[0]), "low": float(max(mean[0] - half[0], 0.0)), "high": float(mean[0] + half[0]),
+        "minutes_before": float(before.mean()), "bound": ">=" if np.isnan(steps).any() else "",
+        "n_reached": int((~np.isnan(steps)).sum()), "n_runs": len(steps),
+    }  # fmt: skip
 
 
 def _across(

@@ -24,6 +24,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_abisim.common.spaces import executed_actions
 from sb3_abisim.data.copies import ImageLayout
 from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED
 from sb3_abisim.data.importing import CHANNELS_KEY, LEFT_OUT_KEY, LOSSY_KEY, UNSEEN_ENDS_KEY
@@ -77,7 +78,9 @@ def import_buffer(
         raise ValueError(f"the {what} is empty; import it after learn()")
     layout = recorded_layout(source.observation_space, image_key, what)
     scaled = off_policy if scaled_actions is None else scaled_actions
-    actions = _executed_actions(source.action_space, buffer.actions, copies, scaled, clipped=not off_policy)
+    if scaled and isinstance(source.action_space, spaces.Box):
+        _require_scaled(buffer.actions, copies)
+    actions = executed_actions(source.action_space, buffer.actions, scaled, clipped=not off_policy)
     left_out = ["rewards", *_lost(copies)]
     if isinstance(source, ReplayBuffer) and not source.handle_timeout_termination:
         left_out.append("which episodes were truncated (without handle_timeout_termination, all count as terminated)")
@@ -202,30 +205,14 @@ def _rollout(source: "RolloutBuffer") -> tuple[_Arrays, list[_Copy]]:
     return _Arrays(observations, observations, 1, by_step(source.actions)), copies
 
 
-def _executed_actions(
-    space: spaces.Space[Any], stored: NDArray[Any], copies: list[_Copy], scaled: bool, clipped: bool
-) -> NDArray[Any]:
-    """The actions as the environments got them.
-
-    :param space: of one action
-    :param stored: [n_steps, n_envs, n]
-    :param copies: which steps count
-    :param scaled: from -1 to 1
-    :param clipped: whether the environments got them clipped to their bounds
-    """
-    stored = stored.reshape(*stored.shape[:2], *(space.shape or ()))
-    if not isinstance(space, spaces.Box):
-        return stored
-    if scaled:
-        largest = max(float(np.abs(stored[copy.order, i]).max(initial=0.0)) for i, copy in enumerate(copies))
-        if largest > 1:
-            raise ValueError(
-                f"the buffer holds actions up to {largest:g}, which are not scaled to -1..1; pass scaled_actions=False "
-                "if they are those of the environment"
-            )
-        stored = space.low + 0.5 * (stored.astype(np.float64) + 1.0) * (space.high.astype(np.float64) - space.low)
-    # Rounding may lead out of the bounds.
-    return (np.clip(stored, space.low, space.high) if clipped or scaled else stored).astype(space.dtype)
+def _require_scaled(stored: NDArray[Any], copies: list[_Copy]) -> None:
+    """Refuse the actions of a ``Box`` that are said to be from -1 to 1, and are not."""
+    largest = max(float(np.abs(stored[copy.order, i]).max(initial=0.0)) for i, copy in enumerate(copies))
+    if largest > 1:
+        raise ValueError(
+            f"the buffer holds actions up to {largest:g}, which are not scaled to -1..1; pass scaled_actions=False "
+            "if they are those of the environment"
+        )
 
 
 def _take(observations: Any, index: NDArray[np.int64], env: int) -> Any:

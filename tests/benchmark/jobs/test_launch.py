@@ -33,6 +33,7 @@ def test_a_job_in_a_program_of_its_own(tmp_path: Path) -> None:
     assert is_done(tmp_path, good.to_json()) and not is_done(tmp_path, bad.to_json())
     manifest = json.loads((tmp_path / "jobs" / f"{good.name}.json").read_bytes())
     assert manifest["source"] == source_hash("encoder")
+    assert 0 < manifest["processor_seconds"] < manifest["seconds"] + 60
     assert (
         manifest["versions"]["torch"]
         and manifest["hardware"]["processor"]

@@ -1,0 +1,209 @@
+"""Fill the tables of docs/ from the committed runs: ``python -m benchmarks.results_page [PAGE ...]``.
+
+A table stands between two comments. The first says in YAML what it shows, and this script writes what is between::
+
+    <!-- table
+    runs: [nav2d_ppo_frozen]                # folders in benchmarks/results/comparison, or LABEL=FOLDER
+    source: training                        # or evaluations; of curves, steps and ratios
+    reference: goal_progress,frozen         # whose steps are divided in ratios; without it, the first row
+    rows: {"ssi,frozen": SSI}               # label of a method: what the table calls it; all methods without it
+    columns: [final stochastic/standard, steps 0.5, ratio 0.5]
+    -->
+    <!-- end -->
+
+A column may be ``{COLUMN: HEADER}``. See :data:`COLUMNS` for what there is.
+"""
+
+import argparse
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from sb3_abisim.benchmark.report import statistics
+from sb3_abisim.benchmark.report.groups import Group, group_runs, labeled_runs
+from sb3_abisim.benchmark.report.tables import time_to
+
+ROOT = Path(__file__).resolve().parent.parent
+RUNS = ROOT / "benchmarks" / "results" / "comparison"
+TABLE = re.compile(r"(<!-- table\n(.*?)-->\n)(.*?)(<!-- end -->)", re.DOTALL)
+
+
+class Cell(NamedTuple):
+    """Where a cell takes its number from.
+
+    :param group: the runs of its row
+    :param first: the runs of the reference
+    :param argument: what follows the column's name
+    """
+
+    group: Group
+    first: Group
+    argument: str
+
+
+def _final(cell: Cell, measure: str) -> list[float]:
+    """The mean of each run's final episodes.
+
+    :param measure: "results" or "successes"
+    :raises ValueError: if a run has none
+    """
+    arrays = [(run.final() or {}).get(f"{cell.argument}/{measure}") for run in cell.group.runs]
+    found = [float(array.mean()) for array in arrays if array is not None]
+    if len(found) < len(arrays):
+        raise ValueError(f"a run of {cell.group.label} has no final {measure} of {cell.argument!r}")
+    return found
+
+
+def _digits(group: Group) -> int:
+    """Behind the point of a return."""
+    return 1 if group.high - group.low > 10 else 2
+
+
+def _plus_minus(values: list[float], digits: int, scale: float = 1.0) -> str:
+    mean, half = statistics.mean_and_interval(np.array(values)[:, None] * scale)
+    if len(values) == 1:
+        return f"{mean[0]:.{digits}f}"
+    return f"{mean[0]:.{digits}f} ± {half[0]:.{digits}f}"
+
+
+def _return(cell: Cell) -> str:
+    return _plus_minus(_final(cell, "results"), _digits(cell.group))
+
+
+def _success(cell: Cell) -> str:
+    return _plus_minus(_final(cell, "successes"), 0, 100) + " %"
+
+
+def _area(cell: Cell) -> str:
+    steps, returns = statistics.on_common_steps([(c.steps, c.returns) for c in cell.group.curves])
+    return _plus_minus(statistics.area_under_curve(steps, returns).tolist(), _digits(cell.group))
+
+
+def _steps(cell: Cell) -> str:
+    steps, horizon = cell.group.steps_to(cell.group.level(float(cell.argument))), cell.group.horizon
+    n_reached = int((~np.isnan(steps)).sum())
+    if not n_reached:
+        return f"not within {horizon:,}"
+    text = f"{round(float(np.nan_to_num(steps, nan=horizon).mean()), -3):,.0f}"
+    return text if n_reached == len(steps) else f"over {text}: {n_reached} of {len(steps)} runs reach it"
+
+
+def _ratio(cell: Cell) -> str:
+    if cell.group.label == cell.first.label:
+        return "1"
+    pair = cell.first, cell.group
+    first, steps = (group.steps_to(group.level(float(cell.argument))) for group in pair)
+    ratio = statistics.steps_ratio(first, steps, (pair[0].horizon, pair[1].horizon))
+    if np.isnan(ratio.value):
+        return "neither reaches it"
+    prefix = {"": "", "<=": "at most ", ">=": "at least ", "~": "about "}[ratio.bound]
+    interval = "" if np.isnan(ratio.low) else f" [{ratio.low:.2f}, {ratio.high:.2f}]"
+    return f"{prefix}{ratio.value:.2f}{interval}"
+
+
+def _minutes(cell: Cell) -> str:
+    found = time_to(cell.group, cell.group.level(float(cell.argument)), "processor_seconds")
+    if found is None:
+        return "unknown"
+    bound, half = ("over " if found["bound"] else ""), (found["high"] - found["low"]) / 2
+    return f"{bound}{found['minutes']:.1f}" + (f" ± {half:.1f}" if np.isfinite(half) else "")
+
+
+def _runs(cell: Cell) -> str:
+    return str(len(cell.group.runs))
+
+
+def _episodes(argument: str) -> str:
+    mode, split = argument.split("/")
+    return mode if split == "standard" else f"{mode}, {split}"
+
+
+def _percent(argument: str) -> str:
+    return f"{float(argument):.0%}".replace("%", " %")
+
+
+# Name: what it writes, and its header; both take what follows the name.
+COLUMNS: dict[str, tuple[Callable[[Cell], str], Callable[[str], str]]] = {
+    "return": (_return, lambda argument: f"final return, {_episodes(argument)}"),
+    "success": (_success, lambda argument: f"success, {_episodes(argument)}"),
+    "area": (_area, lambda argument: "mean return of the run"),
+    "steps": (_steps, lambda argument: f"steps to {_percent(argument)}"),
+    "ratio": (_ratio, lambda argument: f"ratio of steps to {_percent(argument)}"),
+    "minutes": (_minutes, lambda argument: f"minutes of processor time to {_percent(argument)}"),
+    "runs": (_runs, lambda argument: "runs"),
+}
+
+
+def table(spec: dict[str, Any]) -> str:
+    """One table.
+
+    :param spec: see the module
+    :return: lines of Markdown
+    :raises ValueError: for an unknown key, column or row, with what there is
+    """
+    unknown = spec.keys() - {"runs", "source", "reference", "rows", "columns"}
+    if unknown:
+        raise ValueError(f"a table has no {', '.join(sorted(unknown))}")
+    columns = [next(iter(c.items())) if isinstance(c, dict) else (c, None) for c in spec["columns"]]
+    parts = [(*column.partition(" ")[::2], header) for column, header in columns]
+    for name, _, _ in parts:
+        if name not in COLUMNS:
+            raise ValueError(f"a column is one of {', '.join(COLUMNS)}, got {name!r}")
+    runs = labeled_runs([_folder(word) for word in spec["runs"]])
+    rows = spec.get("rows") or {run.label: run.label for run in runs}
+    first = spec.get("reference", next(iter(rows)))
+    (groups,) = group_runs(runs, spec.get("source", "evaluations"), first, []).values()
+    missing = {first, *rows} - groups.keys()
+    if missing:
+        raise ValueError(f"no runs of {', '.join(sorted(missing))}; there are {', '.join(groups)}")
+    lines = [
+        "| | " + " | ".join(header or COLUMNS[name][1](argument) for name, argument, header in parts) + " |",
+        "|---|" + "---:|" * len(parts),
+    ]
+    for label, shown in rows.items():
+        cells = [COLUMNS[name][0](Cell(groups[label], groups[first], argument)) for name, argument, _ in parts]
+        lines.append(f"| {shown} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _folder(word: str) -> str:
+    label, equals, folder = word.rpartition("=")
+    return f"{label}{equals}{RUNS / folder}"
+
+
+def fill(page: str) -> str:
+    """A page with all of its tables made again.
+
+    :param page: its text
+    :raises ValueError: for a table that cannot be made; the message holds its description
+    """
+
+    def write(match: re.Match[str]) -> str:
+        try:
+            return f"{match[1]}\n{table(yaml.safe_load(match[2]))}\n\n{match[4]}"
+        except (ValueError, KeyError) as error:
+            raise ValueError(f"{error}, in the table\n{match[2]}") from error
+
+    return TABLE.sub(write, page)
+
+
+def pages() -> list[Path]:
+    """The pages of docs/ that have such tables."""
+    return [path for path in sorted((ROOT / "docs").rglob("*.md")) if TABLE.search(path.read_text())]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "pages", type=Path, nargs="*", help="pages of Markdown (default: those of docs/)", default=pages()
+    )
+    for path in parser.parse_args().pages:
+        path.write_text(fill(path.read_text()))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""The tables of docs/ say what the committed runs say."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from benchmarks import results_page
+
+RESULTS = results_page.ROOT / "docs" / "results.md"
+SPEC = {"runs": ["nav2d_dqn_target"], "reference": "abisim"}
+
+
+@pytest.mark.parametrize("path", results_page.pages(), ids=lambda path: path.name)
+def test_tables_are_those_of_the_committed_runs(path: Path) -> None:
+    text = path.read_text()
+    assert results_page.fill(text) == text, f"run python -m benchmarks.results_page {path}"
+
+
+def test_the_page_of_results_types_no_number_that_its_tables_and_commands_lack() -> None:
+    """Section by section: a number of two digits or more in prose is in a table or a command."""
+    free = []
+    for section in re.split(r"^## ", RESULTS.read_text(), flags=re.MULTILINE)[1:]:
+        given = "\n".join(line for line in section.splitlines() if line.startswith(("|", "    ")))
+        prose = re.sub(r"<!--.*?-->", "", section, flags=re.DOTALL)
+        prose = "\n".join(line for line in prose.splitlines() if not line.startswith(("|", "    ")))
+        known = {number.replace(",", "") for number in re.findall(r"\d[\d.,]*\d", given)}
+        numbers = re.findall(r"\d[\d.,]*\d", re.sub(r"\]\(.*?\)|`.*?`", "", prose))
+        free += [number for number in numbers if number.replace(",", "").rstrip(".") not in known]
+    assert not free
+
+
+def test_a_wrong_number_in_a_table_is_mended() -> None:
+    text = RESULTS.read_text()
+    number = re.search(r"\| (-\d+\.\d) ± ", text)[1]
+    assert results_page.fill(text.replace(number, "-0.1", 1)) == text
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"columns": ["speed 0.5"]}, "a column is one of .*, got 'speed'"),
+        ({"columns": ["area"], "rows": {"dreamer": "Dreamer"}}, "no runs of dreamer; there are abisim"),
+        ({"columns": ["area"], "size": 3}, "a table has no size"),
+        ({"columns": ["return stochastic/nowhere"]}, "a run of vanilla has no final results of 'stochastic/nowhere'"),
+    ],
+)
+def test_a_table_that_cannot_be_made_says_why(change: dict[str, object], what: str) -> None:
+    text = f"<!-- table\n{yaml.safe_dump({**SPEC, **change})}-->\n<!-- end -->"
+    with pytest.raises(ValueError, match=what):
+        results_page.fill(text)
+
+
+def test_steps_that_not_all_runs_reach_are_bounds() -> None:
+    spec = {
+        **SPEC,
+        "rows": {"abisim": "A", "acro": "ACRO", "vanilla": "scratch"},
+        "columns": ["steps 0.7", "ratio 0.7"],
+    }
+    lines = results_page.table(spec).splitlines()
+    assert lines[2].split("|")[3].strip() == "1"
+    assert "runs reach it" in lines[3] or "not within" in lines[3]
+    assert "not within 200,000" in lines[4]
+    assert lines[4].split("|")[3].strip().startswith(("at most", "neither"))
