@@ -64,6 +64,7 @@ CALLS: dict[str, list[tuple[str, str]]] = {
     ],
     "timm": [("timm", "from sb3_abisim.networks.base import make_encoder; "
             "make_encoder(gym.spaces.Box(0, 255, (3, 32, 32), 'uint8'), 'timm/resnet18')")],
+    "wandb": [("track", "main(['pretrain', '--objective', 'ssi', '--data', 'd', '-o', 'new.safetensors', '--track'])")],
 }  # fmt: skip
 # The heavy imports once, then a process for each hidden module.
 RUNNER = r"""
