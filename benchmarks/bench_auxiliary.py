@@ -85,7 +85,7 @@ def main(argv: list[str] | None = None) -> None:
         f"`python -m benchmarks.bench_auxiliary` on {machine()}: environment steps per second of processor time, "
         f"median of {args.rounds} turns of {2 * N_ENVS * N_STEPS:,} steps, and the median of the time that they take "
         f"more than the turn without an objective in the same round. PPO on `{ENV_ID}` from scratch, "
-        "`AuxiliaryObjective` with its defaults. Other work on the machine moves these numbers by several percent."
+        "`AuxiliaryObjective` with its defaults. Other work on the machine moves single turns."
     )
     header = ["| auxiliary objective | steps per second | more time than without | all turns |", "|---|---:|---:|---:|"]
     tail = (f"At most {MOST:.0%} was asked for.", "")
