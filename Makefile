@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-lowest test-slow format lint type check docs bench figures comparisons benchmark benchmark-smoke clean
+.PHONY: help setup demo test test-lowest test-slow format lint type check docs bench reliability figures comparisons benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -64,6 +64,9 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_scan_nav
 	$(BIN)/python -m benchmarks.bench_malloc
 	$(BIN)/python -m benchmarks.bench_collect
+
+reliability: setup  ## damaged and hostile files, kills, steps and NaN, counted, into docs/limits.md; half an hour
+	$(BIN)/python -m benchmarks.reliability --seed 0
 
 figures: setup  ## make every figure of docs/figures.md again from the committed encoders; about a quarter of an hour
 	$(BIN)/sb3-abisim analyze all --images docs/images --numbers benchmarks/results

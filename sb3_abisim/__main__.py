@@ -19,6 +19,7 @@ COMMANDS = {
     "record": ("sb3_abisim.zoo.record", "record the agent that a run ended with as a GIF"),
     "merge": ("sb3_abisim.zoo.merge", "put a frozen encoder into the model that was trained on its embeddings"),
     "export": ("sb3_abisim.networks.export", "write an encoder as ONNX or a torch.export program"),
+    "push": ("sb3_abisim.push.upload", "upload an encoder with its card to the Hugging Face Hub"),
     "analyze": ("sb3_abisim.analysis.command", "show what an encoder sees: figures and numbers"),
     "benchmark": ("sb3_abisim.benchmark.command", "compare methods over environments and seeds, and report"),
     "zoo": ("sb3_abisim.zoo.command", "any other command of rl-zoo3, such as record_video or all_plots"),

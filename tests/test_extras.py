@@ -33,7 +33,11 @@ CALLS: dict[str, list[tuple[str, str]]] = {
         ("lerobot", "main(['data', 'import', 'lerobot', 'folder', '-o', 'new'])"),
     ],
     "h5py": [("minari", "main(['data', 'import', 'minari', 'a/b-v0', '-o', 'new'])")],
-    "huggingface_hub": [("hub", "main(['export', 'hf://owner/repository/file.safetensors', '-o', 'new.pt2'])")],
+    "huggingface_hub": [
+        ("hub", "main(['export', 'hf://owner/repository/file.safetensors', '-o', 'new.pt2'])"),
+        ("hub", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--no-evidence'])"),
+        ("hub", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--no-evidence', '-o', 'new'])"),
+    ],
     "jinja2": [("benchmark", "main(['benchmark', '-o', 'new'])")],
     "matplotlib": [
         ("plots", "main(['demo', '-o', 'new'])"),
@@ -52,6 +56,7 @@ CALLS: dict[str, list[tuple[str, str]]] = {
     "scipy": [
         ("scan", "gym.make('ScanNav-v0')"),
         ("benchmark", "main(['benchmark', 'report', 'run'])"),
+        ("benchmark", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--benchmark', 'run', '-o', 'new'])"),
     ],
     "sklearn": [
         ("analysis", "main(['analyze', 'probes', '--env', 'Nav2D-v0', 'Nav2D-v0/ssi', '-n', '20'])"),
@@ -59,6 +64,7 @@ CALLS: dict[str, list[tuple[str, str]]] = {
     ],
     "timm": [("timm", "from sb3_abisim.networks.base import make_encoder; "
             "make_encoder(gym.spaces.Box(0, 255, (3, 32, 32), 'uint8'), 'timm/resnet18')")],
+    "wandb": [("track", "main(['pretrain', '--objective', 'ssi', '--data', 'd', '-o', 'new.safetensors', '--track'])")],
 }  # fmt: skip
 # The heavy imports once, then a process for each hidden module.
 RUNNER = r"""

@@ -17,7 +17,7 @@ FLOORS = (
     {"data", "objectives", "rl"},
     {"pretraining", "zoo"},
     {"analysis", "benchmark"},
-    {"demo", "doctor", "__main__"},
+    {"demo", "doctor", "push", "__main__"},
 )
 FLOOR_OF = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 # Imports every module of some folders, and prints which rooms that has brought along.

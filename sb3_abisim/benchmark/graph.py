@@ -13,6 +13,7 @@ from sb3_abisim.benchmark.jobs.job import Job, job_key
 from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.common.cli import parse_pairs
 from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_name import pinned_name
 from sb3_abisim.pretraining.config import FOLLOWING, load_config
 from sb3_abisim.registry import get_method, get_objective, get_traits, methods
 from sb3_abisim.zoo.collect import preprocessing_entry
@@ -162,12 +163,13 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     settings |= method.options
     conf_file, label = method.name, method.name
     if method.encoder is not None:
-        file = load_encoder(method.encoder)
+        encoder = pinned_name(method.encoder)
+        file = load_encoder(encoder)
         check_preprocessing(file, {**used, **replaced}, method.embeds_in_env)
         settings["encoder_hash"] = file.hash
         label += f"-{file.hash[:6]}"
-        path = Path(method.encoder)
-        conf_file += f"={path.resolve() if path.is_file() else method.encoder}"
+        path = Path(encoder)
+        conf_file += f"={path.resolve() if path.is_file() else encoder}"
     elif inputs:
         conf_file += f"={inputs[0].output}"
     settings |= {

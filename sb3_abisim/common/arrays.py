@@ -14,6 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_BYTES = 1 << 28
+# What NumPy and zipfile raise, beside OSError, for bytes that are damaged: a header is parsed as Python.
+ARRAY_ERRORS = (
+    EOFError, KeyError, ValueError, TypeError, IndexError, SyntaxError, NotImplementedError, RuntimeError, MemoryError,
+    OverflowError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+)  # fmt: skip
 
 
 def read_npz(
@@ -33,10 +38,7 @@ def read_npz(
                 raise ValueError(f"it holds {size} bytes, more than {max_bytes}")
             found = [name.removesuffix(".npy") for name in archive.namelist()] if names is None else names
             return {name: _read_npy(archive.read(f"{name}.npy")) for name in found}
-    except (
-        OSError, EOFError, KeyError, ValueError, TypeError, IndexError, SyntaxError, NotImplementedError, RuntimeError,
-        MemoryError, OverflowError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
-    ) as error:  # fmt: skip
+    except (OSError, *ARRAY_ERRORS) as error:
         if isinstance(error, FileNotFoundError | PermissionError):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__

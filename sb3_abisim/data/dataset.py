@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arrays import ARRAY_ERRORS
 from sb3_abisim.common.files import file_hash
 from sb3_abisim.common.spaces import space_from_json
 from sb3_abisim.common.transitions import TransitionBatch
@@ -325,7 +326,7 @@ class TransitionDataset:
         try:
             # Mapped in any case: where a header declares more than the file has, no memory is taken.
             array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, OverflowError) as error:
+        except ARRAY_ERRORS as error:
             raise DatasetError(f"{path} is not an array file of a dataset: {error}") from None
         expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
         if array.dtype != dtype or array.shape != expected:

@@ -33,6 +33,7 @@ from sb3_abisim.data.format import (
     array_file,
     array_layout,
     array_names,
+    check_meta,
     check_spaces,
     describe_factors,
     from_json_file,
@@ -230,10 +231,27 @@ class DatasetWriter:
                 raise DatasetError(f"{error}; remove {folder} and collect it again") from None
             named = {**there, "env_kwargs": current_env_kwargs(there["env_kwargs"])}
             _require_same(folder, named, self._config, identity_keys(self._config))
+            self._require_finished_config(there)
             self._versions_here, self._config = self._config["versions"], there
+            if path.read_bytes() != to_json_bytes(there):
+                # Damage that means nothing, such as another white space.
+                self._write(CONFIG_NAME, to_json_bytes(there))
         else:
             self._versions_here = self._config["versions"]
             self._write(CONFIG_NAME, to_json_bytes(self._config))
+
+    def _require_finished_config(self, config: dict[str, Any]) -> None:
+        """Refuse versions that a finished dataset was not made with: nothing else would contradict them."""
+        try:
+            meta = from_json_file(self.folder / META_NAME)
+            check_meta(meta)
+        except (OSError, ValueError, KeyError, TypeError):
+            return  # there is none, or it is made again
+        if config["versions"] != meta["versions"]:
+            raise DatasetError(
+                f"{self.folder / CONFIG_NAME} is damaged (its versions are not those of {META_NAME}); remove it, and "
+                f"copy it from another copy of the dataset, or remove {self.folder} and collect it again"
+            )
 
     @property
     def is_finished(self) -> bool:

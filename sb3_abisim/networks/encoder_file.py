@@ -12,7 +12,6 @@ import copy
 import hashlib
 import json
 import os
-import re
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -28,20 +27,18 @@ from safetensors import SafetensorError
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_abisim._version import __version__
-from sb3_abisim.common.extras import needs_extra
 from sb3_abisim.common.files import write_atomic
-from sb3_abisim.common.paths import resource_path
 from sb3_abisim.common.spaces import space_from_json, space_to_json
 from sb3_abisim.common.vocabulary import current_env_kwargs, current_settings
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess
 from sb3_abisim.networks.bounded import BoundedTensors
+from sb3_abisim.networks.encoder_name import resolve_encoder
 from sb3_abisim.registry import import_network, is_import_path, is_known_network, networks
 
 FORMAT = 1
 # The embeddings of the reference batch may differ by this fraction of the largest one (other machine, other torch).
 REFERENCE_TOLERANCE = 1e-4
 MAX_FILE_BYTES = 1 << 30
-HUB_PREFIX = "hf://"
 # A zoo run on a frozen encoder keeps a copy of its file under this name, in its folder <env id> beside config.yml.
 RUN_COPY = "encoder.safetensors"
 
@@ -69,10 +66,6 @@ _REMEDY = "copy it again from where it came from, or write it again with sb3-abi
 
 class EncoderFileError(ValueError):
     """The file is damaged or is not an encoder file; the message names the path and the remedy."""
-
-
-class EncoderNotFoundError(FileNotFoundError):
-    """No encoder file of that name; the message lists the places searched."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +177,7 @@ def load_encoder(name: str | os.PathLike[str], network: str | None = None) -> En
     :param name: as for :func:`resolve_encoder`
     :param network: ``pkg.module:Factory`` of a network that is imported first, for a file that names it
     :return: the encoder with its metadata, under today's names
-    :raises EncoderNotFoundError: when there is no such file
+    :raises sb3_abisim.networks.encoder_name.EncoderNotFoundError: when there is no such file
     :raises EncoderFileError: when a bit has changed, the file is something else, its network is not registered, or its
         reference batch does not agree
     """
@@ -264,32 +257,6 @@ def reference_batch(file: EncoderFile) -> tuple[NDArray[np.uint8], NDArray[np.fl
     tensors = safetensors.torch.load_file(file.path)
     observations, embeddings = (tensors[key].numpy() for key in _REFERENCE_KEYS)
     return observations, embeddings
-
-
-def resolve_encoder(name: str | os.PathLike[str]) -> Path:
-    """Find an encoder file.
-
-    :param name: a path; else the name of an encoder that comes with the package, such as
-        "DistractorPointMaze-v0/abisim"; or ``hf://owner/repository/file.safetensors``, downloaded from the Hugging Face
-        Hub (``hf://owner/repository@revision/file.safetensors`` for a fixed revision)
-    :raises EncoderNotFoundError: listing the places searched
-    """
-    text = os.fspath(name)
-    if not text:
-        raise ValueError("encoder must be a path, the name of a shipped encoder or hf://owner/repository/file, got ''")
-    if text.startswith(HUB_PREFIX):
-        return _download(text)
-    folder = resource_path("encoders")
-    candidates = [Path(text).expanduser().absolute(), folder / text, folder / f"{text}.safetensors"]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    searched = ", ".join(str(candidate) for candidate in dict.fromkeys(candidates))
-    shipped = sorted(str(path.relative_to(folder).with_suffix("")) for path in folder.rglob("*.safetensors"))
-    raise EncoderNotFoundError(
-        f"no encoder file {text!r}; searched {searched}. Shipped encoders: {', '.join(shipped) or 'none'}. "
-        f"Correct the name, or write the file with sb3-abisim pretrain"
-    )
 
 
 def _describe(observation_space: gym.Space[Any]) -> dict[str, Any]:
@@ -403,20 +370,3 @@ def _check_reference(path: Path, actual: th.Tensor, expected: th.Tensor) -> None
             f"{path}: the network embeds the reference batch differently than when it was saved (largest difference "
             f"{error:.3g}, embeddings up to {scale:.3g}); install the versions named in its metadata, or pretrain again"
         )
-
-
-def _download(name: str) -> Path:
-    match = re.fullmatch(r"hf://([^/@]+/[^/@]+)(?:@([^/]+))?/(.+)", name)
-    if match is None:
-        raise ValueError(f"a Hub name looks like hf://owner/repository/file.safetensors, got {name!r}")
-    repository, revision, filename = match.groups()
-    try:
-        with needs_extra("hub", name):
-            from huggingface_hub import hf_hub_download
-    except ImportError as error:
-        # As for any other file that is not there: a saved model is loaded without it.
-        raise EncoderNotFoundError(str(error)) from error
-    try:
-        return Path(hf_hub_download(repository, filename, revision=revision))
-    except (OSError, ValueError) as error:
-        raise EncoderNotFoundError(f"{name} could not be downloaded: {error}") from error

@@ -1,7 +1,9 @@
 """Checkpoints of a pretraining run: weights, optimizer, random state and position in one safetensors file."""
 
+import contextlib
 import hashlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -129,17 +131,47 @@ def _read(path: Path, module: nn.Module, optimizer: th.optim.Optimizer, settings
     content, hash = whole[:-_HASH_BYTES], whole[-_HASH_BYTES:]
     if hashlib.sha256(content).digest() != hash:
         raise ValueError(f"{path} is damaged; remove it to go on from the checkpoint before it")
-    tensors = load_tensors(content)
-    header_size = int.from_bytes(content[:8], "little")
-    metadata: dict[str, Any] = json.loads(json.loads(content[8 : 8 + header_size])["__metadata__"]["run"])
-    if not (rate_is_constant(settings) and asks_for_more_updates(metadata["settings"], settings)):
-        refuse_other_settings(path, metadata["settings"], settings)
-    module.load_state_dict({k.removeprefix("module."): v for k, v in tensors.items() if k.startswith("module.")})
+    with _one_sentence(path):
+        tensors = load_tensors(content)
+        header_size = int.from_bytes(content[:8], "little")
+        metadata: dict[str, Any] = json.loads(json.loads(content[8 : 8 + header_size])["__metadata__"]["run"])
+        there = dict(metadata["settings"])
+        continues = rate_is_constant(settings) and asks_for_more_updates(there, settings)
+    if not continues:
+        refuse_other_settings(path, there, settings)
+    with _one_sentence(path):
+        module.load_state_dict({k.removeprefix("module."): v for k, v in tensors.items() if k.startswith("module.")})
+        optimizer.load_state_dict(
+            {"state": _optimizer_state(tensors, optimizer), "param_groups": optimizer.state_dict()["param_groups"]}
+        )
+        n_updates, rows = metadata["n_updates"], metadata["rows"]
+        if type(n_updates) is not int or n_updates < 0:
+            raise ValueError(f"{n_updates!r} updates")
+        if not all(type(value) in (int, float) for row in rows for value in row.values()):
+            raise ValueError("rows of a log that are no numbers")
+        th.set_rng_state(tensors["rng"])
+    return metadata
+
+
+def _optimizer_state(tensors: dict[str, th.Tensor], optimizer: th.optim.Optimizer) -> dict[int, dict[str, th.Tensor]]:
+    shapes = [parameter.shape for group in optimizer.param_groups for parameter in group["params"]]
     state: dict[int, dict[str, th.Tensor]] = {}
     for name, tensor in tensors.items():
         if name.startswith("optimizer."):
             _, index, key = name.split(".")
+            if tensor.dim() and tensor.shape != shapes[int(index)]:
+                raise ValueError(f"{name} has the shape {tuple(tensor.shape)}, its weight {tuple(shapes[int(index)])}")
             state.setdefault(int(index), {})[key] = tensor
-    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
-    th.set_rng_state(tensors["rng"])
-    return metadata
+    return state
+
+
+@contextlib.contextmanager
+def _one_sentence(path: Path) -> Iterator[None]:
+    """The hash is that of any content: what is forged can be wrong in any way."""
+    try:
+        yield
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise ValueError(
+            f"{path} is no checkpoint of this run ({reason}); remove it to go on from the checkpoint before it"
+        ) from error

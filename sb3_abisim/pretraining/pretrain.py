@@ -23,6 +23,7 @@ _BASE = "base."
 
 if TYPE_CHECKING:
     from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.pretraining.track import Tracking
     from sb3_abisim.pretraining.trainer import Callback
 
 
@@ -38,6 +39,7 @@ def pretrain(
     verbose: int = 1,
     callback: "Callback | None" = None,
     keep_checkpoint: bool = False,
+    track: "Tracking | None" = None,
 ) -> Path:
     """Train an encoder and write its file and model card; go on where an interrupted call with equal arguments stopped.
 
@@ -57,6 +59,8 @@ def pretrain(
         name; the encoder file does not depend on it
     :param keep_checkpoint: keep the last checkpoint when the run ends. With a constant learning rate, the same call
         with a larger ``n_updates`` then goes on from there, to the bytes of a run that had them from the start
+    :param track: shows the log's rows on Weights & Biases, those of a base encoder that is pretrained first in a run of
+        their own; the encoder file does not depend on it
     :return: the encoder file
     :raises ValueError: if the output belongs to other settings, or anything does not fit together
     :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
@@ -64,6 +68,7 @@ def pretrain(
     from sb3_abisim.common.files import folder_lock, remove_temporaries
     from sb3_abisim.common.malloc import keep_freed_memory
     from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.data.image_warning import warn_of_images
     from sb3_abisim.networks.base import make_encoder
     from sb3_abisim.pretraining.card import refuse_to_replace
     from sb3_abisim.pretraining.trainer import PretrainRun, make_objective
@@ -85,6 +90,7 @@ def pretrain(
         config = load_config(objective, env_id, config)
     dataset = TransitionDataset(data, eval_fraction=config.eval_fraction)
     _check_parts(dataset, config)
+    warn_of_images(dataset, stacklevel=2)
     if base_method is not None and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
         # Mistakes in the settings of this objective are found before the base is trained.
@@ -101,7 +107,7 @@ def pretrain(
             eval_fraction=config.eval_fraction,
             batch_size=batch_size if "batch_size" in base_settings else min(batch_size, config.batch_size),
         )
-        pretrain(base_method, data, base, base_config, None, seed, device, progress_bar, verbose)
+        pretrain(base_method, data, base, base_config, None, seed, device, progress_bar, verbose, track=track)
     if base_method is None and base is not None:
         raise ValueError(f"{objective!r} builds on no base encoder, got base={base!r}; leave it out")
     folder = output.with_suffix(".run")
@@ -109,7 +115,7 @@ def pretrain(
     try:
         with folder_lock(folder):
             remove_temporaries(folder)
-            run = PretrainRun(objective, dataset, output, config, base, seed, device, callback, keep_checkpoint)
+            run = PretrainRun(objective, dataset, output, config, base, seed, device, callback, keep_checkpoint, track)
             if run.is_finished():
                 run.clean_up()
                 if verbose:
@@ -210,11 +216,30 @@ def main(argv: Sequence[str] | None = None) -> None:
         "--keep-checkpoint", action="store_true",
         help="keep the last one when the run ends, so that it can be given more updates later",
     )  # fmt: skip
+    track = parser.add_argument_group("Weights & Biases", "as in rl-zoo3")
+    track.add_argument("--track", action="store_true", help="show the log there (default: no)")
+    track.add_argument("--wandb-project-name", metavar="NAME", help="the project (default: sb3)")
+    track.add_argument("--wandb-entity", metavar="NAME", help="user or team that the project belongs to")
+    track.add_argument("-tags", "--wandb-tags", nargs="+", metavar="TAG", help="of the run, such as pr-123")
     parser.add_argument("--verbose", type=int, default=1, choices=(0, 1), help="1 prints the log (default: 1)")
     run(parser, argv, _command, "interrupted; the same command goes on from the last checkpoint")
 
 
+def _tracking(args: argparse.Namespace) -> "Tracking | None":
+    """:raises ValueError: for words that would not hold, since nothing is tracked"""
+    given = {"project": args.wandb_project_name, "entity": args.wandb_entity, "tags": args.wandb_tags}
+    words = {name: value for name, value in given.items() if value is not None}
+    if not args.track:
+        if words:
+            raise ValueError(f"--wandb-... is given ({words}), but nothing is tracked; add --track, or leave it out")
+        return None
+    from sb3_abisim.pretraining.track import Tracking
+
+    return Tracking(**{**words, "tags": tuple(args.wandb_tags or ())})
+
+
 def _command(args: argparse.Namespace) -> None:
+    track = _tracking(args)
     data = Path(args.data)
     env_id = read_env_id(data)
     if args.env is not None and env_id != args.env:
@@ -222,5 +247,5 @@ def _command(args: argparse.Namespace) -> None:
     settings = parse_pairs(args.params, "-params")
     pretrain(
         args.objective, data, args.output, settings, args.base, args.seed, args.device,
-        verbose=args.verbose, keep_checkpoint=args.keep_checkpoint,
+        verbose=args.verbose, keep_checkpoint=args.keep_checkpoint, track=track,
     )  # fmt: skip

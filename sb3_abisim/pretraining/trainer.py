@@ -25,6 +25,7 @@ from sb3_abisim.pretraining.checkpoint import (
     refuse_other_settings,
 )
 from sb3_abisim.pretraining.config import FOLLOWING, N_EVAL_BATCHES, PretrainConfig
+from sb3_abisim.pretraining.track import Tracking
 from sb3_abisim.registry import get_objective
 
 # From the encoder in evaluation mode to further numbers for a row of the log.
@@ -74,6 +75,7 @@ class PretrainRun:
     :param device: as in Stable-Baselines3
     :param callback: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
     :param keep_checkpoint: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
+    :param track: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
     """
 
     def __init__(
@@ -87,8 +89,9 @@ class PretrainRun:
         device: str,
         callback: Callback | None = None,
         keep_checkpoint: bool = False,
+        track: Tracking | None = None,
     ) -> None:
-        self.keep_checkpoint = keep_checkpoint
+        self.keep_checkpoint, self.track = keep_checkpoint, track
         self.dataset, self.output, self.config, self.seed = dataset, output, config, seed
         self.callback = callback
         self.folder = output.with_suffix(".run")
@@ -315,6 +318,8 @@ class PretrainRun:
 
     def _logger(self, verbose: int) -> Logger:
         """SB3's logger, with the rows of an interrupted run written again so that the table is whole."""
+        # First, since it may be refused.
+        tracked = [self.track.start(self.folder, self.dataset.env_id, self.settings)] if self.track else []
         formats = ["csv", "tensorboard"] + (["stdout"] if verbose else [])
         logger = configure(str(self.folder), formats)
         for output in logger.output_formats:
@@ -323,6 +328,7 @@ class PretrainRun:
                     values = {"train/n_updates": row["n_updates"], **row}
                     del values["n_updates"]
                     output.write(dict(sorted(values.items())), dict.fromkeys(values, ()))
+        logger.output_formats += tracked
         return logger
 
 

@@ -23,8 +23,8 @@ class EncoderCallback(BaseCallback):
     training started with, relative to the norm of the latter. Where actor and critic have separate encoders, it is the
     largest value.
 
-    Training stops at the first reward, observation, loss or weight that is NaN or infinite: some algorithms would train
-    to the end with it, and save a model that knows nothing.
+    Training stops at the first reward, observation, action, loss or weight that is NaN or infinite: some algorithms
+    would train to the end with it, and save a model that knows nothing.
 
     Also prints the content hash of the clips or scans that the training environment shows, if it has one, and lets
     torch reuse memory (:mod:`sb3_abisim.common.malloc`).
@@ -161,11 +161,17 @@ class EncoderCallback(BaseCallback):
         self._check_logged()
 
     def _on_step(self) -> bool:
-        self._require_finite("reward", self.locals.get("rewards"))
-        observations = self.locals.get("new_obs")
-        for name, array in observations.items() if isinstance(observations, dict) else [("observation", observations)]:
-            self._require_finite(name, array)
+        for name in ("action", "reward"):
+            self._require_finite(name, self.locals.get(f"{name}s"))
+        self._require_finite_observations("observation", self.locals.get("new_obs"))
+        for info in self.locals.get("infos") or ():
+            # Where an episode has ended, the others are those of the next one.
+            self._require_finite_observations("last observation of an episode", info.get("terminal_observation"))
         return True
+
+    def _require_finite_observations(self, name: str, observations: Any) -> None:
+        for key, array in observations.items() if isinstance(observations, dict) else [(name, observations)]:
+            self._require_finite(key, array)
 
     def _on_training_end(self) -> None:
         self._fine_tuning.remove(self.model)

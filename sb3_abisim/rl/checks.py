@@ -8,7 +8,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 from torch import nn
 
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.extractors import BaseEncoderExtractor, EncoderExtractor, PretrainedExtractor
 from sb3_abisim.rl.vec_encode import VecEncodeObservations

@@ -28,7 +28,8 @@ from torch import nn
 
 from sb3_abisim.common.images import ImageCheck
 from sb3_abisim.networks.base import Encoder, make_encoder
-from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.rl.augment import Augment
 from sb3_abisim.rl.auxiliary_state import AuxiliarySlot
 from sb3_abisim.rl.file_network import build_network, check_objective, read_network
@@ -232,7 +233,7 @@ class PretrainedExtractor(BaseEncoderExtractor):
 
     :param observation_space: uint8 images in 0..255, channels first; equal to that of pretraining
     :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
-        ``hf://owner/repository/file.safetensors``. If there is none, ``forward`` raises until weights are restored by
+        ``hf://owner/repository``. If there is none, ``forward`` raises until weights are restored by
         ``load`` or ``set_parameters``
     :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
     :param network: name of the network; None takes the one made for the observation's shape
@@ -363,7 +364,7 @@ class EncoderExtractor(PretrainedExtractor):
 
     :param observation_space: uint8 images in 0..255, channels first; equal to that of pretraining
     :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
-        ``hf://owner/repository/file.safetensors``
+        ``hf://owner/repository``
     :param freeze: True keeps the weights as they are; False lets the RL algorithm train them
     :param network: name of the network; None reads it from the file, unless that is a ``pkg.module:Factory``, which is
         imported only if you name it

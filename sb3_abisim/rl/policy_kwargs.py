@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_name import pinned_name
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.extractors import EncoderExtractor
 from sb3_abisim.rl.file_network import stored_network
@@ -23,7 +24,7 @@ def policy_kwargs(
     """``policy_kwargs`` for an encoder file; a new dictionary at every call, since SB3 writes into it.
 
     What the file knows is read from it. Its network stands in the result, so that a saved model loads where the file
-    is absent.
+    is absent. A name on the Hub gets the commit that it leads to now.
 
     :param encoder: as for :class:`~sb3_abisim.rl.extractors.EncoderExtractor`; for dictionary observations a mapping
         of image keys to such files
@@ -44,12 +45,14 @@ def policy_kwargs(
     kwargs: dict[str, Any]
     if isinstance(encoder, Mapping):
         extractor = CombinedEncoderExtractor
+        names = {key: pinned_name(file) for key, file in encoder.items()}
         kwargs = {
-            "encoders": {key: os.fspath(file) for key, file in encoder.items()},
-            "networks": {key: stored_network(load_encoder(file, network)) for key, file in encoder.items()},
+            "encoders": names,
+            "networks": {key: stored_network(load_encoder(name, network)) for key, name in names.items()},
         }
     else:
-        kwargs = {"encoder": os.fspath(encoder), **stored_network(load_encoder(encoder, network))}
+        name = pinned_name(encoder)
+        kwargs = {"encoder": name, **stored_network(load_encoder(name, network))}
     return {
         "features_extractor_class": extractor,
         "features_extractor_kwargs": {**kwargs, "freeze": freeze, **(extractor_kwargs or {})},

@@ -56,7 +56,7 @@ class VecEncodeObservations(VecEnvWrapper):
     :param venv: gives uint8 images in 0..255, as the encoder saw in pretraining; channels last are put first, as
         Stable-Baselines3 does for features extractors. Single observations are stacked for an encoder of stacks
     :param encoder: path of an encoder file, name of a shipped one such as "Nav2D-v0/abisim", or
-        ``hf://owner/repository/file.safetensors``
+        ``hf://owner/repository``
     :param objective: refuse an encoder that another objective has trained; None takes any
     :param device: where to run the encoder, as in Stable-Baselines3
     :raises FileNotFoundError: if there is no such encoder

@@ -20,6 +20,7 @@ from sb3_abisim.rl.vec_encode import EncodedBox
 from sb3_abisim.zoo.entries import hyperparameters_entry, read_entries
 from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, normalizes_observations, other_vec_wrappers
+from sb3_abisim.zoo.run_envs import saved_means
 from sb3_abisim.zoo.runs import read_run
 
 
@@ -65,8 +66,12 @@ def model_policy(name: str, epsilon: float, trust: bool = False) -> Policy:
     """
     path = Path(name)
     run = read_run(path if path.is_dir() else path.parent)
-    if normalizes_observations(run.settings.get("normalize")):
-        raise ValueError(f"{run.folder} was trained on normalized observations, which are not collected")
+    means = saved_means(run)
+    if means is not None and run.settings.get("frame_stack"):
+        raise ValueError(
+            f"{run.folder} was trained on stacks of normalized observations, which are not made here; give a run "
+            "without one of the two"
+        )
     path = run.folder / f"{run.env_name}.zip" if path.is_dir() else path
     if not path.is_file():
         raise ValueError(f"--policy: there is no model {path}; give a run's folder, or a .zip in it")
@@ -75,6 +80,11 @@ def model_policy(name: str, epsilon: float, trust: bool = False) -> Policy:
         # Trained on embeddings.
         model = merge_encoder(model, str(run.folder / run.env_name / RUN_COPY))
     space = model.observation_space
+    if means is not None and means.observation_space.shape != space.shape:
+        raise ValueError(
+            f"{run.folder} has means of observations {means.observation_space.shape}, and its model takes "
+            f"{space.shape}; copy the run again, or give one whose observations have their channels first"
+        )
 
     def act(observations: NDArray[np.uint8]) -> NDArray[Any]:
         if observations.shape[1:] != space.shape:
@@ -82,7 +92,8 @@ def model_policy(name: str, epsilon: float, trust: bool = False) -> Policy:
                 f"{path} takes observations {space.shape}, and the dataset's are {observations.shape[1:]}; give its "
                 "environment, --env-wrapper and --frame-stack"
             )
-        actions: NDArray[Any] = model.predict(observations, deterministic=True)[0]
+        seen: Any = observations if means is None else means.normalize_obs(observations)
+        actions: NDArray[Any] = model.predict(seen, deterministic=True)[0]
         return actions
 
     return Policy(act, f"{run.algo} {file_hash(path)[:16]}", epsilon)

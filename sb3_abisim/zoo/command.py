@@ -14,6 +14,7 @@ from sb3_abisim.zoo.auxiliary import GRAMMAR, parse_auxiliary
 from sb3_abisim.zoo.guard import GUARDED, guarded
 from sb3_abisim.zoo.manager import MethodExperimentManager
 from sb3_abisim.zoo.methods import grammar, split_options
+from sb3_abisim.zoo.whole_files import saves_whole
 
 # The commands of rl-zoo3 by name: the module, and an example.
 SCRIPTS = {
@@ -29,6 +30,8 @@ _WITH_PACKAGES = ("train", "enjoy")
 # Reads a pickle that only it and its like write.
 _UNPICKLES = "plot_from_file"
 _TRUST = "--trust"
+# Before training has begun, they are mistakes of the command.
+_MISTAKES = (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error)
 _PACKAGES = ("--packages", "--gym-packages")
 _CONF_FILE = ("-conf", "--conf-file")
 _AUXILIARY = "--auxiliary"
@@ -58,11 +61,12 @@ def main(argv: Sequence[str]) -> None:
             print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
             print(f"{_AUXILIARY} {GRAMMAR} trains the encoder by an objective, too: --auxiliary abisim:weight=0.5.")
         print("--packages MODULE ... imports modules that register environments, methods, networks or readers.")
-        if command in (*GUARDED, _UNPICKLES):
+        if command in (*GUARDED, _UNPICKLES, "train"):
             print(f"{_TRUST} opens the pickles of a run folder, which execute whatever they hold: for your own alone.")
         print(f"example: {prog} {example}\n")
     MethodExperimentManager.has_begun = False
     is_trusted = _TRUST in flags
+    MethodExperimentManager.builds_from_yaml = not is_trusted
     try:
         if command == _UNPICKLES and not is_trusted and not {"-h", "--help"} & set(flags):
             raise ValueError(
@@ -78,19 +82,38 @@ def main(argv: Sequence[str]) -> None:
         sys.argv = [prog, *words]
         # rl_zoo3.plots imports its commands, which runpy would warn of.
         warnings.filterwarnings("ignore", "'rl_zoo3.plots", RuntimeWarning)
-        with guarded() if command in GUARDED and not is_trusted else contextlib.nullcontext():
+        with contextlib.ExitStack() as stack:
+            if command in GUARDED and not is_trusted:
+                stack.enter_context(guarded())
+            if command == "train":
+                stack.enter_context(saves_whole())
             runpy.run_module(module, run_name="__main__")
     except FloatingPointError as error:
-        # Training has stopped, and no model was saved.
+        # Training has stopped, and no final model was saved.
         print(f"{prog}: {one_line(error)}", file=sys.stderr)
         sys.exit(1)
-    except (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error) as error:
+    except Exception as error:
+        if MethodExperimentManager.has_begun and (system := _system_error(error)) is not None:
+            print(f"{prog}: {one_line(system)}; training has stopped", file=sys.stderr)
+            sys.exit(1)
+        if not isinstance(error, _MISTAKES):
+            raise
         # Of TypeErrors, an unknown hyperparameter or argument of an environment is a mistake of the command.
         is_mistake = not isinstance(error, TypeError) or "unexpected keyword argument" in str(error)
         if MethodExperimentManager.has_begun or not is_mistake:
             raise
         print(f"{prog}: error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
+    finally:
+        MethodExperimentManager.builds_from_yaml = False
+
+
+def _system_error(error: BaseException) -> OSError | None:
+    """What the system said, such as that a disk is full: it may lie beneath what a library made of it."""
+    below: BaseException | None = error
+    while below is not None and not isinstance(below, OSError):
+        below = below.__cause__ or below.__context__
+    return below
 
 
 def for_rl_zoo3(flags: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -15,7 +15,7 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 
-from sb3_abisim.zoo.models import load_model
+from sb3_abisim.zoo.models import load_model, read_model_run
 from sb3_abisim.zoo.named import read_text
 from sb3_abisim.zoo.preprocessing import items, wrapper_classes
 from sb3_abisim.zoo.run_files import RunLoader, read_yaml
@@ -47,11 +47,7 @@ class _Models:
 
         :param path: the zip
         """
-        try:
-            run = read_run(Path(path).parent)
-        except ValueError as error:
-            raise ValueError(f"{error}; if you made {path} or trust whoever did, --trust unpickles it") from error
-        return load_model(Path(path), run)
+        return load_model(Path(path), read_model_run(Path(path)))
 
 
 class _Normalizers:
@@ -86,8 +82,8 @@ def saved_hyperparams(
     if not path.is_file():
         raise ValueError(f"{stats_path} holds no config.yml, which says how the run was set up")
     if path.with_name("args.yml").is_file():
-        # The command reads it next, and could not say which file has what nobody reads.
-        read_yaml(path.with_name("args.yml"))
+        # The command reads it next, and could not say which file lacks what, or has what nobody reads.
+        read_run(path.parents[1])
     hyperparams = read_yaml(path)
     for key, kind in (("env_wrapper", gym.Wrapper), ("vec_env_wrapper", VecEnvWrapper)):
         if items(hyperparams.get(key)):

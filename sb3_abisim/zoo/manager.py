@@ -37,7 +37,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
-from sb3_abisim.networks.encoder_file import RUN_COPY, EncoderNotFoundError, load_encoder, resolve_encoder
+from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError, resolve_encoder
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
@@ -53,8 +54,10 @@ from sb3_abisim.zoo.entries import (
 )
 from sb3_abisim.zoo.method_record import MethodRecord
 from sb3_abisim.zoo.methods import MethodSpec, split_options
+from sb3_abisim.zoo.models import continued_model, read_model_run
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
-from sb3_abisim.zoo.run_files import hash_run
+from sb3_abisim.zoo.run_files import MEANS_NAME, hash_run
+from sb3_abisim.zoo.saved_spaces import read_vec_normalize
 from sb3_abisim.zoo.spaces import check_replayed, check_spaces
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
@@ -84,6 +87,8 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     _spec: MethodSpec | None = None
     # Whether a run of this process has begun to train: errors before that are mistakes of the command.
     has_begun = False
+    # Whether saved models are built from the YAML of their runs, so that no pickle is opened.
+    builds_from_yaml = False
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """As rl-zoo3 does, from our files and with a method's values.
@@ -274,7 +279,11 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
         """Refuse ``-i`` with another extractor: rl-zoo3 keeps the model's, and would record the one asked for."""
         asked = hyperparams.get("policy_kwargs") or {}
-        model: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
+        try:
+            model = self._saved_agent(hyperparams, env)
+        except BaseException:
+            env.close()
+            raise
         try:
             check_trained_with(model, asked, unfreezes(self._used))
         except ValueError as error:
@@ -285,6 +294,38 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             _, extractor = find_extractors(model.policy)[0]
             self._record = dataclasses.replace(self._record, encoder_hash=extractor.hash)
         return model
+
+    def _saved_agent(self, hyperparams: dict[str, Any], env: Any) -> BaseAlgorithm:
+        if not self.builds_from_yaml:
+            unpickled: BaseAlgorithm = super()._load_pretrained_agent(hyperparams, env)
+            return unpickled
+        path = Path(self.trained_agent)
+        buffer = path.with_name("replay_buffer.pkl")
+        if buffer.is_file():
+            raise ValueError(
+                f"{buffer} is a pickle, which executes whatever it holds; add --trust for yours, or move it elsewhere"
+            )
+        run = read_model_run(path)
+        if run.algo != self.algo:
+            raise ValueError(f"{path} is a model of {run.algo}, not {self.algo}; give --algo {run.algo}")
+        kept = {name: value for name, value in hyperparams.items() if name not in ("policy", "policy_kwargs")}
+        kept |= {"seed": self.seed, "tensorboard_log": self.tensorboard_log, "verbose": self.verbose}
+        return continued_model(path, run, env, self.device, kept)
+
+    def _maybe_normalize(self, env: Any, eval_env: bool) -> Any:
+        """As rl-zoo3 does; saved means are read by an unpickler that makes nothing else."""
+        path = Path(self.trained_agent).parent / self.env_name / MEANS_NAME
+        if not (self.builds_from_yaml and path.is_file()):
+            return super()._maybe_normalize(env, eval_env)
+        try:
+            normalize = read_vec_normalize(path)
+        except ValueError:
+            env.close()
+            raise
+        normalize.set_venv(env)
+        if eval_env:
+            normalize.training, normalize.norm_reward = False, False
+        return normalize
 
     def hyperparameters_optimization(self) -> None:
         """As rl-zoo3 does, except that an extractor of ours survives a trial's ``policy_kwargs``."""

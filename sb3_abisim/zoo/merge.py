@@ -10,8 +10,7 @@ from sb3_abisim.common.cli import add_trust, make_parser, run
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.rl.merge import merge_encoder
-from sb3_abisim.zoo.models import algorithm_class, load_model, unpickled_model
-from sb3_abisim.zoo.runs import read_run
+from sb3_abisim.zoo.models import algorithm_class, load_model, read_model_run, unpickled_model
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -53,13 +52,7 @@ def _command(args: argparse.Namespace) -> None:
 def _model(args: argparse.Namespace) -> BaseAlgorithm:
     if args.trust:
         return unpickled_model(args.model, args.algo)
-    try:
-        zoo_run = read_run(args.model.parent)
-    except ValueError as error:
-        raise ValueError(
-            f"{args.model} lies in no folder of a run, whose YAML would say how to build it ({error}); if you made it "
-            "or trust whoever did, --trust unpickles it"
-        ) from error
+    zoo_run = read_model_run(args.model)
     if zoo_run.algo != args.algo:
         raise ValueError(f"{args.model} is a model of {zoo_run.algo}, not {args.algo}; give --algo {zoo_run.algo}")
     return load_model(args.model, zoo_run)

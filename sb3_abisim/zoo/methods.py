@@ -1,12 +1,14 @@
 """Methods: which features extractor a zoo run uses, as a word of the command and as hyperparameters."""
 
+import contextlib
 import importlib.util
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_abisim.networks.encoder_file import EncoderFile, EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError, pinned_name
 from sb3_abisim.registry import get_augmentation, get_method, methods
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
@@ -31,7 +33,7 @@ class MethodSpec:
     """Which features extractor a run is to use.
 
     :param name: a registered method
-    :param encoder: a file, a shipped encoder's name or ``hf://owner/repository/file``; None for the shipped encoder of
+    :param encoder: a file, a shipped encoder's name or ``hf://owner/repository``; None for the shipped encoder of
         this method and the environment
     :param frozen: whether the weights stay as they are during RL
     :param task_features_dim: size of the trainable network beside the encoder, 0 for none
@@ -196,6 +198,9 @@ class MethodSpec:
 
     def _encoder(self, shipped: str | None) -> str:
         if self.encoder is not None:
+            # The run says which commit it used. Where there is none to be had, whoever needs the file says so.
+            with contextlib.suppress(EncoderNotFoundError):
+                return pinned_name(self.encoder)
             return self.encoder
         if shipped is None:
             raise ValueError(

@@ -7,6 +7,7 @@ Of the pickles, those of the two spaces alone are opened, by an unpickler that m
 Memory is bounded by the size of the zip before it is taken.
 """
 
+import contextlib
 import importlib
 import inspect
 import io
@@ -25,12 +26,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.save_util import load_from_zip_file, recursive_setattr
+from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_abisim.networks.bounded import BoundedTensors
 from sb3_abisim.rl.unfreeze import unfreeze_encoder
 from sb3_abisim.zoo.named import named_class, named_policy_kwargs
 from sb3_abisim.zoo.run_files import read_yaml
-from sb3_abisim.zoo.runs import Run
+from sb3_abisim.zoo.runs import Run, read_run
 from sb3_abisim.zoo.saved_spaces import read_space
 
 # Attributes that go on with the weights: plain numbers in the zip.
@@ -43,7 +46,24 @@ _LEFT_OUT = {
     "env", "device", "verbose", "tensorboard_log", "_init_setup_model", "seed", "policy", "policy_kwargs",
     "replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage",
 }  # fmt: skip
+# Of these, those that name classes or sizes: of a model that is trained on, the command's hold.
+_OF_BUFFERS = ("replay_buffer_class", "replay_buffer_kwargs", "optimize_memory_usage")
 _DATA_NAME = "data"
+
+
+def read_model_run(path: Path) -> Run:
+    """The run that a saved model lies in.
+
+    :param path: the zip
+    :raises ValueError: if it lies in none, naming the flag that unpickles it
+    """
+    try:
+        return read_run(path.parent)
+    except ValueError as error:
+        raise ValueError(
+            f"{path} lies in no folder of a run, whose YAML would say how to build it ({error}); if you made it "
+            "or trust whoever did, --trust unpickles it"
+        ) from error
 
 
 def load_model(path: Path, run: Run, trust: bool = False) -> BaseAlgorithm:
@@ -60,24 +80,72 @@ def load_model(path: Path, run: Run, trust: bool = False) -> BaseAlgorithm:
     if trust:
         return unpickled_model(path, run.algo)
     where = run.folder / run.env_name / "config.yml"
-    try:
-        data, size = _read_data(path)
-    except Exception as error:
-        raise ValueError(f"{path} is damaged or no model of Stable-Baselines3 ({error}); copy it again") from error
-    try:
+    data, size = _checked_data(path)
+    with _one_sentence(path, where):
         spaces = read_space(data.get("observation_space")), read_space(data.get("action_space"))
         arguments = model_arguments(run.algo, read_yaml(where), spaces[1], str(where))
         with BoundedTensors(size):
             model = _build(run.algo, arguments, *spaces, seed=data.get("seed"))
         _restore(model, path, data)
+    return model
+
+
+def _checked_data(path: Path) -> tuple[dict[str, Any], int]:
+    try:
+        return _read_data(path)
     except Exception as error:
-        # A foreign file can be wrong in any way.
+        raise ValueError(f"{path} is damaged or no model of Stable-Baselines3 ({error}); copy it again") from error
+
+
+@contextlib.contextmanager
+def _one_sentence(path: Path, where: Path) -> Iterator[None]:
+    """A foreign file can be wrong in any way."""
+    try:
+        yield
+    except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(
             f"{path} cannot be built from {where.name} and its weights alone: {reason}; if you made it or trust "
             "whoever did, --trust unpickles it"
         ) from error
-    return model
+
+
+def continued_model(path: Path, run: Run, env: VecEnv, device: str, hyperparams: Mapping[str, Any]) -> BaseAlgorithm:
+    """A saved model of a run that is to be trained on: to the bit what ``load(path, env=env, **hyperparams)`` gives.
+
+    :param path: the zip
+    :param run: whose ``config.yml`` says what to build
+    :param env: to train in
+    :param device: to train on
+    :param hyperparams: take the place of those of the run; as rl-zoo3 has made them
+    :raises ValueError: for a damaged zip, a model that cannot be built from the YAML, or other spaces
+    """
+    where = run.folder / run.env_name / "config.yml"
+    data, size = _checked_data(path)
+    with _one_sentence(path, where):
+        saved = read_space(data.get("observation_space")), read_space(data.get("action_space"))
+        config = read_yaml(where)
+        arguments = model_arguments(run.algo, config, saved[1], str(where))
+        del arguments["n_envs"]
+        for name in _OF_BUFFERS:
+            if name in config and name not in hyperparams:
+                raise ValueError(f"it was trained with {name}, which is not given now")
+        algorithm = algorithm_class(run.algo)
+    env = algorithm._wrap_env(env, 0)
+    try:
+        check_for_correct_spaces(env, *saved)
+    except ValueError as error:
+        raise ValueError(f"{path} was trained in another environment: {error}") from error
+    with _one_sentence(path, where):
+        with BoundedTensors(size):
+            model: Any = algorithm(env=env, device=device, _init_setup_model=False, **arguments)  # type: ignore[call-arg]
+            model.observation_space, model.action_space = saved
+        # The buffers are as large as this command says, whatever the zip holds.
+        vars(model).update(hyperparams)
+        model._setup_model()
+        _restore(model, path, data, device)
+    continued: BaseAlgorithm = model
+    return continued
 
 
 def unpickled_model(path: Path, algo: str) -> BaseAlgorithm:
@@ -174,12 +242,12 @@ def _require_stored(archive: zipfile.ZipFile, size: int) -> None:
         raise ValueError("it holds more than its size; Stable-Baselines3 compresses nothing")
 
 
-def _restore(model: BaseAlgorithm, path: Path, data: Mapping[str, Any]) -> None:
+def _restore(model: BaseAlgorithm, path: Path, data: Mapping[str, Any], device: str = "cpu") -> None:
     params, variables = _read_tensors(path)
     if _n_optimized(params) > _n_optimized(model.get_parameters()):
         # Saved after unfreeze_at, and built from a configuration that says freeze: true.
         unfreeze_encoder(model)
-    model.set_parameters(params, exact_match=True, device="cpu")
+    model.set_parameters(params, exact_match=True, device=device)
     for name, value in (variables or {}).items():
         if value is not None and name in model._get_torch_save_params()[1]:
             recursive_setattr(model, f"{name}.data", value.data)

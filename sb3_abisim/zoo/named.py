@@ -13,7 +13,7 @@ from typing import Any
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn, optim
 
-from sb3_abisim.networks.encoder_file import HUB_PREFIX
+from sb3_abisim.networks.encoder_name import HUB_PREFIX
 from sb3_abisim.registry import is_import_path, named_packages, networks
 
 # What this package stands on: their modules are imported, since they only define.

@@ -6,14 +6,16 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.registry import get_traits
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
 from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.preprocessing import class_name, items, normalizes_observations, recorded_wrapper
+from sb3_abisim.zoo.run_files import MEANS_NAME
 from sb3_abisim.zoo.runs import Run
+from sb3_abisim.zoo.saved_spaces import read_vec_normalize
 
 Wrapper = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 
@@ -23,8 +25,8 @@ def final_model(run: Run, trust: bool = False) -> BaseAlgorithm:
 
     :param run: a zoo run
     :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
-    :raises ValueError: if the run has not ended, if its environment is not registered, if it was trained on normalized
-        observations, or as :func:`~sb3_abisim.zoo.models.load_model`
+    :raises ValueError: if the run has not ended, if its environment is not registered, or as
+        :func:`~sb3_abisim.zoo.models.load_model`
     """
     try:
         gym.spec(run.env_id)
@@ -33,12 +35,6 @@ def final_model(run: Run, trust: bool = False) -> BaseAlgorithm:
             f"{run.folder} was trained in {run.env_id}, which is not registered here; give the module that "
             "registers it with --packages"
         ) from error
-    if normalizes_observations(run.settings.get("normalize")):
-        # Their means lie in a pickle.
-        raise ValueError(
-            f"{run.folder} was trained on normalized observations, which are not rebuilt here; look at it with "
-            "sb3-abisim enjoy"
-        )
     path = run.folder / f"{run.env_name}.zip"
     if not path.is_file():
         raise ValueError(f"{run.folder} holds no final model ({path.name}); let the run end first")
@@ -61,7 +57,8 @@ def make_run_env(
     :param env_kwargs: arguments of each
     :param seed: of the first copy
     :param inner: goes around each environment, under the run's own wrappers
-    :raises ValueError: for wrappers of packages that are not imported, or observations that are not those of the model
+    :raises ValueError: for wrappers of packages that are not imported, means of observations that are not there or
+        damaged, or observations that are not those of the model
     """
     where = str(run.folder / run.env_name / "config.yml")
     outer = recorded_wrapper(run.settings.get("env_wrapper"), where=where)
@@ -75,6 +72,8 @@ def make_run_env(
     try:
         for item in items(run.settings.get("vec_env_wrapper")):
             env = _wrap_all(env, item, run, where)
+        if (normalize := saved_means(run)) is not None:
+            env = _normalized(env, normalize, run)
         if run.settings.get("frame_stack"):
             env = VecFrameStack(env, run.settings["frame_stack"])
         # As at training: images with channels last are put first.
@@ -98,6 +97,37 @@ def _wrap_all(env: VecEnv, item: Any, run: Run, where: str) -> VecEnv:
     assert wrap is not None
     wrapped: VecEnv = wrap(env)
     return wrapped
+
+
+def saved_means(run: Run) -> VecNormalize | None:
+    """What normalizes the observations of a run as at the end of its training; rewards stay as they are.
+
+    :param run: a zoo run
+    :return: without an environment; None for a run on observations as they are
+    :raises ValueError: if the file is not there, or is damaged
+    """
+    if not normalizes_observations(run.settings.get("normalize")):
+        return None
+    path = run.folder / run.env_name / MEANS_NAME
+    if not path.is_file():
+        raise ValueError(f"{run.folder} was trained on normalized observations, and {path} is not there; copy it again")
+    means = read_vec_normalize(path)
+    if not means.norm_obs:
+        raise ValueError(
+            f"{run.folder} was trained on normalized observations, and {path} has none; copy the run again"
+        )
+    means.training, means.norm_reward = False, False
+    return means
+
+
+def _normalized(env: VecEnv, means: VecNormalize, run: Run) -> VecEnv:
+    if means.observation_space.shape != env.observation_space.shape:
+        raise ValueError(
+            f"{run.folder} has means of observations {means.observation_space}, but its environment shows "
+            f"{env.observation_space} here; install the versions of then, or train again"
+        )
+    means.set_venv(env)
+    return means
 
 
 def split_kwargs(env_id: str, env_kwargs: dict[str, Any], split: str | None) -> dict[str, Any]:

@@ -18,6 +18,8 @@ from sb3_abisim.common.yaml_text import read_yaml_file
 
 # The training episodes of an exported run, averaged: see Run.training.
 TRAINING_CURVE = "training.npz"
+# The means of VecNormalize, in <Env>/ of a run's folder.
+MEANS_NAME = "vecnormalize.pkl"
 # Whatever a report or a rebuilt model depends on; beside them, a run's folder has models and logs.
 _RESULTS = (
     "*.monitor.csv", "evaluations.npz", "final_evaluations.npz", TRAINING_CURVE, "*/args.yml", "*/config.yml",
@@ -73,7 +75,9 @@ def hash_run(folder: Path) -> None:
 
     :param folder: of a run
     """
-    write_hashes(folder, result_names(folder))
+    # A report needs no means, so that a folder without their hash is read, too.
+    means = [path.relative_to(folder).as_posix() for path in folder.glob(f"*/{MEANS_NAME}")]
+    write_hashes(folder, [*result_names(folder), *means])
 
 
 def hash_again(folder: Path) -> None:

@@ -18,7 +18,8 @@ from sb3_abisim.analysis.figures import FIGURES, default_encoders
 from sb3_abisim.analysis.sweep import sweep_encoders
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.data.collect import collect
-from sb3_abisim.networks.encoder_file import load_encoder, resolve_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_name import resolve_encoder
 from sb3_abisim.pretraining.config import load_config
 
 PNG = b"\x89PNG\r\n"

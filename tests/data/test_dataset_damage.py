@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dataset_inputs import collect_index, rewrite_meta, without_hashes
+from dataset_inputs import N, collect_index, rewrite_meta, tree, without_hashes
 
 import sb3_abisim.data.dataset as dataset_module
 from sb3_abisim.common.files import file_hash
+from sb3_abisim.data import chains
+from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
-from sb3_abisim.data.format import CUT, HASH_KEY, INSIDE, META_NAME, TERMINATED, DatasetError, make_meta
+from sb3_abisim.data.format import CONFIG_NAME, CUT, HASH_KEY, INSIDE, META_NAME, TERMINATED, DatasetError, make_meta
 
 CHAINED = {"format_version": 3, "shards_per_chain": 1}
 
@@ -124,6 +126,15 @@ def test_a_pickle_in_place_of_an_array_is_not_run(copy: Path, tmp_path: Path) ->
     assert not (tmp_path / "executed").exists()
 
 
+def test_a_header_that_never_ends_is_one_sentence(copy: Path) -> None:
+    """NumPy reads it as Python, whose tokenizer raises an error of its own."""
+    path = copy / "actions-00000.npy"
+    path.write_bytes(b"\x93NUMPY\x01\x00\x40\x00" + b"(" * 200)
+    rewrite_meta(copy, json.loads((copy / META_NAME).read_bytes()))
+    with pytest.raises(DatasetError, match=r"actions-00000\.npy is not an array file of a dataset"):
+        TransitionDataset(copy)
+
+
 @pytest.mark.parametrize(
     ("change", "held"),
     [(lambda a: a.astype(np.int32), r"int32 \((\d+),\)"), (lambda a: np.stack([a, a], axis=1), r"int64 \(\d+, 2\)")],
@@ -206,3 +217,18 @@ def test_hash_depends_on_data_and_arguments_but_not_on_versions(copy: Path) -> N
     assert make_meta(config | {"versions": {"numpy": "0"}}, shards)[HASH_KEY] == meta[HASH_KEY]
     assert make_meta(config | {"seed": 4}, shards)[HASH_KEY] != meta[HASH_KEY]
     assert make_meta(config, shards[::-1])[HASH_KEY] != meta[HASH_KEY]
+
+
+def test_a_damaged_config_does_not_alter_a_finished_dataset(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of its keys, the versions alone are not compared with the command's."""
+    monkeypatch.setattr(chains, "SHARD_TRANSITIONS", 48)
+    before, config = tree(copy), (copy / CONFIG_NAME).read_bytes()
+    (copy / CONFIG_NAME).write_bytes(config.replace(b"\n", b"\r", 1).replace(b": ", b":\t", 1))
+    assert (copy / CONFIG_NAME).read_bytes() != config
+    collect("IndexEnv-v0", N, copy, n_envs=4, seed=3)
+    assert tree(copy) == before
+    versions = json.loads(config)["versions"]
+    changed = {**json.loads(config), "versions": {**versions, "numpy": "0.0"}}
+    (copy / CONFIG_NAME).write_text(json.dumps(changed))
+    with pytest.raises(DatasetError, match=r"config\.json is damaged \(its versions are not those of meta\.json\)"):
+        collect("IndexEnv-v0", N, copy, n_envs=4, seed=3)

@@ -16,7 +16,8 @@ from sb3_abisim.__main__ import main
 from sb3_abisim.common.extras import is_installed
 from sb3_abisim.networks import export as export_module
 from sb3_abisim.networks.base import preprocess
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, reference_batch
+from sb3_abisim.networks.encoder_file import reference_batch
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.networks.export import export_encoder
 
 DOCS = Path(__file__).parents[2] / "docs" / "export.md"

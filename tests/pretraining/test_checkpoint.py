@@ -1,14 +1,18 @@
 """Interruption changes nothing, and what belongs to another run is refused."""
 
+import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import safetensors.torch
 import torch as th
 from pretrain_inputs import SETTINGS, collect_grids, run
 
@@ -310,3 +314,52 @@ def test_a_checkpoint_with_the_names_of_another_version_is_gone_on_from(data, tm
     stopped = run(data, tmp_path / "stopped" / "ssi.safetensors")
     for suffix in (".safetensors", ".json"):
         assert stopped.with_suffix(suffix).read_bytes() == whole.with_suffix(suffix).read_bytes()
+
+
+def forge(path: Path, change: Callable[[dict[str, Any], dict[str, th.Tensor]], None]) -> None:
+    """Rewrite a checkpoint with a right hash."""
+    content = path.read_bytes()[:-32]
+    size = int.from_bytes(content[:8], "little")
+    metadata = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["run"])
+    tensors = safetensors.torch.load(content)
+    change(metadata, tensors)
+    forged = safetensors.torch.save(tensors, {"run": json.dumps(metadata)})
+    path.write_bytes(forged + hashlib.sha256(forged).digest())
+
+
+FORGERIES: dict[str, Callable[[dict[str, Any], dict[str, th.Tensor]], Any]] = {
+    "no settings": lambda m, t: m.pop("settings"),
+    "settings of a list": lambda m, t: m.update(settings=[1]),
+    "no rows": lambda m, t: m.pop("rows"),
+    "rows of texts": lambda m, t: m.update(rows=[{"loss": "x"}]),
+    "updates before the first": lambda m, t: m.update(n_updates=-1),
+    "updates of a text": lambda m, t: m.update(n_updates="9"),
+    "no weight": lambda m, t: t.pop("module.0.weight"),
+    "a weight too many": lambda m, t: t.update({"module.9.weight": th.ones(2)}),
+    "a weight of another shape": lambda m, t: t.update({"module.0.weight": th.ones(2)}),
+    "a moment of another shape": lambda m, t: t.update({"optimizer.0.exp_avg": th.ones(7, 7)}),
+    "a moment of no weight": lambda m, t: t.update({"optimizer.99.exp_avg": th.ones(2)}),
+    "a name of four parts": lambda m, t: t.update({"optimizer.0.a.b": th.ones(2)}),
+    "no random state": lambda m, t: t.pop("rng"),
+    "a random state of floats": lambda m, t: t.update(rng=th.ones(5)),
+}
+
+
+@pytest.mark.parametrize("forgery", FORGERIES)
+def test_a_forged_checkpoint_is_one_sentence(forgery: str, tmp_path: Path) -> None:
+    module, optimizer = trained()
+    checkpoints = Checkpoints(tmp_path, {"n_updates": 9, "learning_rate": 1.0})
+    checkpoints.save(module, optimizer, 3, [{"loss": 1.0}])
+    (path,) = tmp_path.iterdir()
+    forge(path, lambda metadata, tensors: None)
+    assert checkpoints.restore(*trained()) == (3, [{"loss": 1.0}])
+    forge(path, FORGERIES[forgery])
+    with pytest.raises(ValueError, match=r"000000003\.safetensors is no checkpoint of this run \(.*; remove it"):
+        checkpoints.restore(*trained())
+
+
+@pytest.mark.parametrize("content", [b"", b"[" * 10_000, (2**60).to_bytes(8, "little"), b"\x02" + bytes(7) + b"{}"])
+def test_a_file_of_something_else_with_a_right_hash(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "checkpoint-000000003.safetensors").write_bytes(content + hashlib.sha256(content).digest())
+    with pytest.raises(ValueError, match="is no checkpoint of this run"):
+        Checkpoints(tmp_path, {"n_updates": 9, "learning_rate": 1.0}).restore(*trained())

@@ -2,12 +2,16 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch as th
+from gymnasium.spaces import Box, Discrete
 from pretrain_inputs import SETTINGS, collect_grids, run
 
 from sb3_abisim.data.collect import collect
 from sb3_abisim.data.dataset import TransitionDataset
+from sb3_abisim.data.format import TERMINATED
+from sb3_abisim.data.writer import Segment, write_dataset
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.card import read_card
 from sb3_abisim.pretraining.config import PretrainConfig, load_config
@@ -203,3 +207,14 @@ def test_pretraining_keeps_freed_memory(data, tmp_path, monkeypatch):
     monkeypatch.setattr("sb3_abisim.common.malloc.keep_freed_memory", lambda: calls.append(True))
     run(data, tmp_path / "ssi.safetensors")
     assert calls
+
+
+def test_images_that_can_hardly_be_any_are_named(tmp_path):
+    draw = np.random.default_rng(0)
+    segment = Segment(draw.choice(2, (101, 3, 15, 15)).astype(np.uint8), draw.integers(0, 4, 100), TERMINATED)
+    spaces_of = {"observation_space": Box(0, 255, (3, 15, 15), np.uint8), "action_space": Discrete(4)}
+    write_dataset(tmp_path / "d", [segment], env_id="Nav2D-v0", source="", **spaces_of)
+    settings = {"n_updates": 1, "batch_size": 16, "eval_fraction": 0.0}
+    with pytest.warns(UserWarning, match="none of .* observations exceeds 1") as warned:
+        pretrain("ssi", tmp_path / "d", tmp_path / "e.safetensors", settings, progress_bar=False, verbose=0)
+    assert warned[0].filename == __file__

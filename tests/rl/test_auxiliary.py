@@ -17,6 +17,7 @@ from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.registry import get_objective, methods
 from sb3_abisim.rl.auxiliary import AuxiliaryObjective
 from sb3_abisim.rl.auxiliary_state import KEY
+from sb3_abisim.rl.callbacks import EncoderCallback
 from sb3_abisim.rl.checks import find_extractors
 
 VARIANTS = [(name, False) for name in ALGORITHMS] + [(name, True) for name in SHARING]
@@ -88,6 +89,42 @@ def test_it_moves_the_online_encoders_and_nothing_else(
         assert len(expected) == 2
 
 
+def test_task_features_are_left_to_rl() -> None:
+    model = build("PPO", features_extractor_kwargs={"network": "Flat", "task_features_dim": 3})
+    extractor = model.policy.features_extractor
+    assert [*extractor.task_features.parameters()]
+    trained = {f"features_extractor.encoder.{name}" for name, _ in extractor.encoder.named_parameters()}
+    assert moved_by(AuxiliaryObjective("ssi", **SMALL), model) == trained
+
+
+def test_it_sees_no_augmented_observations() -> None:
+    noise = {"augment": "random_noise", "augment_kwargs": {"strength": 1.0}}
+    updated = []
+    for kwargs in ({}, noise):
+        after: list[Any] = []
+        model = build("PPO", features_extractor_kwargs={"network": "Flat", **kwargs})
+        model.learn(16, CallbackList([AuxiliaryObjective("ssi", **SMALL), Watch(after)]))
+        assert model.policy.features_extractor.augment is not None or not kwargs
+        updated.append(after[0][0])
+    assert all(th.equal(updated[0][name], updated[1][name]) for name in updated[0])
+
+
+@pytest.mark.parametrize("kwargs", [{"encoder_trained_by": "critic"}, {"encoder_lr": 1e-6}])
+def test_its_rate_and_gradients_are_its_own_beside_fine_tuning(kwargs: dict[str, Any]) -> None:
+    updated = []
+    for arguments in ({}, kwargs):
+        after: list[Any] = []
+        model = build("SAC", make_envs(continuous=True), other_sharing=True, learning_starts=30)
+        auxiliary = AuxiliaryObjective("ssi", update_interval=2, batch_size=16)
+        model.learn(40, CallbackList([EncoderCallback(**arguments), auxiliary, Watch(after)]))
+        # The first update of both; that of RL comes after it.
+        n = [bool(values.get("auxiliary/n_updates")) for _, values in after].index(True)
+        updated.append(after[n][0])
+        weights = "actor.features_extractor.encoder.layers.1.weight"
+        assert not th.equal(after[n - 1][0][weights], after[n][0][weights])
+    assert all(th.equal(updated[0][name], updated[1][name]) for name in updated[0])
+
+
 def test_gradients_of_rl_are_left_as_they_are() -> None:
     model = build("PPO")
 
@@ -106,8 +143,10 @@ def test_gradients_of_rl_are_left_as_they_are() -> None:
     model.learn(32, CallbackList([Mark(), AuxiliaryObjective("ssi", **SMALL), Look()]))
 
 
-@pytest.mark.parametrize("name", ["PPO", "A2C", "DQN", "SAC"])
-@pytest.mark.parametrize("objective", ["ssi", "abisim", "beta_vae"])
+@pytest.mark.parametrize(
+    ("name", "objective"),
+    [(name, "ssi") for name in ALGORITHMS] + [(name, o) for name in ("PPO", "SAC") for o in ("abisim", "beta_vae")],
+)
 def test_weight_0_is_plain_stable_baselines3(name: str, objective: str) -> None:
     """Parameters, the optimizer, the environments and all random numbers, bit for bit."""
     outcomes = []
@@ -115,7 +154,15 @@ def test_weight_0_is_plain_stable_baselines3(name: str, objective: str) -> None:
         model = build(name)
         model.learn(120, callback)
         state = {n: t for n, t in model.policy.state_dict().items() if not n.endswith("auxiliary_state")}
-        outcomes.append((state, th.get_rng_state(), np.random.get_state()[1], model._last_obs))
+        optimizers = [
+            tensor
+            for name, parameters in model.get_parameters().items()
+            if name.endswith("optimizer")
+            for held in parameters["state"].values()
+            for tensor in held.values()
+        ]
+        assert optimizers
+        outcomes.append((state, th.get_rng_state(), np.random.get_state()[1], model._last_obs, *optimizers))
         if callback is not None:
             trainer = next(iter(callback._trainers.values()))
             assert trainer.n_updates > 3
@@ -220,6 +267,15 @@ def test_goals_follow_the_base(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not th.equal(goals[0], goals[1])
 
 
+def test_two_extractors_have_random_numbers_of_their_own() -> None:
+    model = build("PPO", other_sharing=True)
+    callback = AuxiliaryObjective("ssi", **SMALL)
+    model.learn(16, callback)
+    actor, critic = callback._trainers.values()
+    assert not th.equal(actor._randomness.state, critic._randomness.state)
+    assert actor._generator.bit_generator.state != critic._generator.bit_generator.state
+
+
 def test_nothing_of_the_log_collides_with_two_copies(capsys: pytest.CaptureFixture[str]) -> None:
     """Stable-Baselines3 shortens names for the terminal, and refuses two that become equal."""
     model = build("PPO", other_sharing=True, verbose=1)
@@ -253,28 +309,39 @@ def test_an_infinite_gradient_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(th.equal(before[name], p) for name, p in model.policy.named_parameters())
 
 
-@pytest.mark.parametrize("objective", ["ssi", "acro", "info_nce"])
+# What says that an objective has learned: a term, and how much of what it is without the loss may be left.
+LEARNED = {
+    "ssi": ("inverse_nll", 0.5), "acro": ("inverse_nll", 0.9), "info_nce": ("info_nce", 0.8), "curl": ("info_nce", 0.7),
+    "abisim": ("metric_loss", 0.1), "beta_vae": ("squared_error", 0.1), "goal_progress": ("progress_loss", 0.2),
+}  # fmt: skip
+
+
+def test_it_is_known_of_each_objective_whether_it_has_learned() -> None:
+    assert LEARNED.keys() == {*OBJECTIVES}
+
+
+@pytest.mark.parametrize("objective", LEARNED)
 def test_it_learns_while_rl_runs_and_not_without_its_loss(objective: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    accuracies = []
-    for has_loss in (True, False):
-        objective_class: Any = get_objective(objective)
-        if not has_loss:
-            plain = objective_class.loss
+    term, share = LEARNED[objective]
+    objective_class: Any = get_objective(objective)
+    plain = objective_class.loss
 
-            def loss(self: Any, batch: Any, plain: Any = plain) -> Any:
-                value, terms = plain(self, batch)
-                return 0.0 * value, terms
+    def no_loss(self: Any, batch: Any) -> Any:
+        value, terms = plain(self, batch)
+        return 0.0 * value, terms
 
-            monkeypatch.setattr(objective_class, "loss", loss)
+    found = []
+    for loss in (plain, no_loss):
+        monkeypatch.setattr(objective_class, "loss", loss)
         notes: list[Any] = []
         model = build("PPO", make_envs(4, limit=6), learning_rate=1e-5, n_epochs=1)
         # An observation shows the action that led to it, so the first of two is not to be seen.
-        kwargs = {"k": [1, 2]} if objective == "acro" else {}
-        callback = AuxiliaryObjective(objective, update_interval=4, batch_size=128, learning_rate=0.01, **kwargs)
-        model.learn(1600, CallbackList([callback, Watch(notes)]))
-        found = [values["auxiliary/accuracy"] for _, values in notes if "auxiliary/accuracy" in values]
-        accuracies.append(np.mean(found[-20:]))
-    assert accuracies[0] > accuracies[1] + 0.15
+        kwargs = {"k": [1, 2]} if objective == "acro" else KWARGS.get(objective, {})
+        callback = AuxiliaryObjective(objective, update_interval=4, batch_size=64, learning_rate=0.01, **kwargs)
+        model.learn(1200, CallbackList([callback, Watch(notes)]))
+        name = f"auxiliary/{term}"
+        found.append(np.mean([values[name] for _, values in notes if name in values][-10:]))
+    assert found[0] < share * found[1]
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -442,5 +509,7 @@ def test_an_encoder_without_its_file_is_refused(tmp_path: Any) -> None:
         from extractor_inputs import build as build_pretrained
 
         model = build_pretrained("DQN", tmp_path / "absent.safetensors", freeze=False)
+    # Now, and not once it acts by its policy.
+    model.learning_starts = 1000
     with pytest.raises(FileNotFoundError, match="no pretrained weights"):
         model.learn(16, AuxiliaryObjective("ssi"))

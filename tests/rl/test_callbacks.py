@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
 from sb3_abisim.networks.base import make_encoder
 from sb3_abisim.networks.encoder_file import save_encoder
@@ -213,6 +213,49 @@ def test_training_stops_at_a_number_that_is_none(algorithm: type[BaseAlgorithm],
         policy = "CnnPolicy"
     model: Any = algorithm(policy, Broken(where, algorithm is SAC), device="cpu", **settings)  # type: ignore[call-arg]
     with pytest.raises(FloatingPointError, match=f"^{where} is NaN or infinite at step 20, and training stops"):
+        model.learn(64, callback=EncoderCallback())
+
+
+class Wrong(VecEnvWrapper):
+    """A wrapper of vectors that gives, at the twentieth step, the last observation of an episode as no number."""
+
+    n_steps = 0
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+    def step_wait(self) -> Any:
+        observations, rewards, dones, infos = self.venv.step_wait()
+        self.n_steps += 1
+        if self.n_steps == 20:
+            dones[0], infos[0]["terminal_observation"] = True, np.full(3, np.inf, np.float32)
+        return observations, rewards, dones, infos
+
+
+@pytest.mark.parametrize("algorithm", [DQN, SAC, PPO])
+def test_training_stops_at_the_last_observation_of_an_episode(algorithm: type[BaseAlgorithm]) -> None:
+    settings: dict[str, Any] = {"n_steps": 32, "batch_size": 32} if algorithm is PPO else {"buffer_size": 50}
+    env = Wrong(DummyVecEnv([lambda: Broken("observation", algorithm is SAC)]))
+    env.venv.envs[0].n_steps = 1000  # type: ignore[attr-defined]  # its own number has been
+    model: Any = algorithm("MlpPolicy", env, device="cpu", **settings)  # type: ignore[call-arg]
+    with pytest.raises(FloatingPointError, match=r"^last observation of an episode is NaN or infinite at step 20,"):
+        model.learn(64, callback=EncoderCallback())
+
+
+@pytest.mark.parametrize("algorithm", [SAC, PPO])
+def test_training_stops_at_an_action_that_is_none(algorithm: type[BaseAlgorithm]) -> None:
+    settings: dict[str, Any] = {"n_steps": 32, "batch_size": 32} if algorithm is PPO else {"buffer_size": 50}
+    model: Any = algorithm("MlpPolicy", Grid(True), device="cpu", **settings)  # type: ignore[call-arg]
+    owner, name = (model.policy, "forward") if algorithm is PPO else (model, "_sample_action")
+    act = getattr(owner, name)
+
+    def broken(*args: Any, **kwargs: Any) -> Any:
+        actions, *rest = act(*args, **kwargs)
+        actions[0, 1] = np.nan if model.num_timesteps == 20 else actions[0, 1]
+        return (actions, *rest)
+
+    setattr(owner, name, broken)
+    with pytest.raises(FloatingPointError, match=r"^action is NaN or infinite at step 21, and training stops"):
         model.learn(64, callback=EncoderCallback())
 
 

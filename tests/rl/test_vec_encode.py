@@ -14,7 +14,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTransposeImage, unwrap_vec_wrapper
 
 from sb3_abisim.networks import base as networks
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
 
 
@@ -169,6 +170,8 @@ def test_a_model_is_not_continued_on_another_encoder(path: Path, tmp_path: Path)
     assert isinstance(again.observation_space, EncodedBox)
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         sb3.A2C.load(tmp_path / "model.zip", env=VecEncodeObservations(counters(), str(other)), device="cpu")
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        again.set_env(VecEncodeObservations(counters(), str(other)))
     assert EncodedBox(3, "ab") == EncodedBox(3, "ab") != EncodedBox(4, "ab")
     assert EncodedBox(3, "ab") != spaces.Box(-np.inf, np.inf, (3,), np.float32)
     assert repr(EncodedBox(3, "ab")) == "EncodedBox(3, hash='ab')"

@@ -1,5 +1,6 @@
 """rl-zoo3's commands with our methods, in this process and in fresh ones."""
 
+import errno
 import gc
 import importlib
 import os
@@ -209,6 +210,25 @@ def test_errors_of_training_keep_their_traceback(
     words = ["--algo", "ppo", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "64", "--eval-freq", "-1"]
     with pytest.raises(error, match="in training"):
         run(monkeypatch, "train", *words, "--conf-file", "vanilla", "-params", *SMALL["ppo"])
+
+
+@pytest.mark.parametrize("is_beneath", [False, True])
+def test_a_full_disk_in_the_middle_of_training_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], is_beneath: bool
+) -> None:
+    def save(*_: Any, **__: Any) -> None:
+        full = OSError(errno.ENOSPC, "No space left on device", "model.zip")
+        if is_beneath:
+            raise RuntimeError("a writer of PyTorch failed") from full
+        raise full
+
+    monkeypatch.setattr(PPO, "save", save)
+    words = ["--algo", "ppo", "--env", "Nav2D-v0", "-f", str(tmp_path), "-n", "64", "--eval-freq", "-1"]
+    with pytest.raises(SystemExit) as stopped:
+        run(monkeypatch, "train", *words, "--conf-file", "vanilla", "-params", *SMALL["ppo"])
+    error = capsys.readouterr().err.splitlines()
+    assert stopped.value.code == 1 and not any("Traceback" in line for line in error)
+    assert error[-1].startswith("sb3-abisim train: [Errno 28] No space left on device: 'model.zip'; training has")
 
 
 def test_errors_that_are_no_mistakes_keep_their_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

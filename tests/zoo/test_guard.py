@@ -93,3 +93,16 @@ def test_a_tag_that_only_names_imports_nothing(logs: Path, tmp_path: Path, monke
     (args.parents[1] / "hashes.json").unlink()
     enjoy(monkeypatch, tmp_path / "logs")
     assert not marker.exists()
+
+
+@pytest.mark.parametrize("name", ["env_kwargs", "seed", "n_timesteps"])
+def test_a_file_that_lacks_something_is_one_sentence(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    shutil.copytree(logs, tmp_path / "logs")
+    args = tmp_path / "logs" / "ppo" / f"{ENV_ID}_1" / ENV_ID / "args.yml"
+    args.write_text(args.read_text().replace(f"- {name}\n", f"- {name}_\n"))
+    (args.parents[1] / "hashes.json").unlink()
+    with pytest.raises(SystemExit) as stopped:
+        enjoy(monkeypatch, tmp_path / "logs")
+    assert stopped.value.code == 2 and "args.yml was not written by rl_zoo3.train" in capsys.readouterr().err

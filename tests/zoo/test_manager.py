@@ -18,7 +18,8 @@ from zoo_inputs import SMALL, write_encoder
 
 from sb3_abisim.common.paths import resource_path
 from sb3_abisim.envs import ENV_IDS
-from sb3_abisim.networks.encoder_file import EncoderNotFoundError, load_encoder
+from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.registry import get_method, methods
 from sb3_abisim.rl.checks import check_trained_with, find_extractors
 from sb3_abisim.rl.extractor_classes import extractor_class

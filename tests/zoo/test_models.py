@@ -3,7 +3,6 @@
 import base64
 import contextlib
 import io
-import json
 import os
 import pickle
 import re
@@ -21,38 +20,16 @@ import torch as th
 import yaml
 from benchmark_inputs import write_run
 from gymnasium import spaces
+from model_inputs import CASES, CONTINUOUS, ENV_ID, Execute, flat, rewrite, train, write_encoder_once
 from stable_baselines3.common.env_util import make_vec_env
-from zoo_inputs import SMALL, run, write_encoder
+from zoo_inputs import run
 
 from sb3_abisim.zoo.models import algorithm_class, load_model, model_arguments
 from sb3_abisim.zoo.named import named_policy_kwargs, read_text
 from sb3_abisim.zoo.run_envs import final_model, make_run_env
 from sb3_abisim.zoo.runs import Run, read_run
 
-ENV_ID = "Nav2D-v0"
-CONTINUOUS = "ContinuousPointMaze-v0"
-NORMALIZED = [*SMALL["ppo"], "normalize:{'norm_obs': False, 'norm_reward': True}"]
 VANILLA = {"features_extractor_class": "sb3_abisim.VanillaExtractor"}
-CASES = {
-    "ppo": ("ppo", ENV_ID, "", SMALL["ppo"]),
-    "ppo-frozen": ("ppo", ENV_ID, ",frozen", [*SMALL["ppo"], "learning_rate:lin_0.001"]),
-    "ppo-normalized": ("ppo", ENV_ID, "", NORMALIZED),
-    "dqn": ("dqn", ENV_ID, "", SMALL["dqn"]),
-    "dqn-frozen": ("dqn", ENV_ID, ",frozen", SMALL["dqn"]),
-    "sac": ("sac", CONTINUOUS, ",frozen", SMALL["sac"]),
-}
-
-
-def train(patch: pytest.MonkeyPatch, folder: Path, algo: str, env_id: str, method: str, *words: str) -> Run:
-    encoder = write_encoder_once(folder, env_id)
-    flags = ["--algo", algo, "--env", env_id, "-f", str(folder), "--conf-file", f"abisim={encoder}{method}"]
-    run(patch, "train", *flags, "-n", "300", "--eval-freq", "-1", "--num-threads", "1", "-params", *words)
-    return read_run(folder / algo / f"{env_id}_1")
-
-
-def write_encoder_once(folder: Path, env_id: str) -> Path:
-    write_encoder(folder / "e.safetensors", env_id)
-    return folder / "e.safetensors"
 
 
 @pytest.fixture(scope="module")
@@ -99,14 +76,6 @@ def agree(made: Run) -> None:
     env.close()
 
 
-def flat(value: Any) -> list[Any]:
-    if isinstance(value, th.Tensor):
-        return value.flatten().tolist()
-    if isinstance(value, dict | list | tuple):
-        return [x for part in (value.values() if isinstance(value, dict) else value) for x in flat(part)]
-    return [value]
-
-
 def save_run(folder: Path, env_id: str, algo: str, config: dict[str, Any], n_timesteps: int) -> Run:
     """A run as rl-zoo3 makes it of a configuration, without its command: of our extractor, from random weights."""
     folder = write_run(folder, env_id, "vanilla", 0, [100], np.zeros((1, 2)), algo=algo)
@@ -137,28 +106,6 @@ def save_run(folder: Path, env_id: str, algo: str, config: dict[str, Any], n_tim
 )  # fmt: skip
 def test_other_algorithms(tmp_path: Path, env_id: str, algo: str, config: dict[str, Any]) -> None:
     agree(save_run(tmp_path, env_id, algo, {"n_envs": 2, **config}, 64))
-
-
-class Execute:
-    """A pickle of it makes a file when it is opened."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> Any:
-        return Path.touch, (self.path,)
-
-
-def rewrite(path: Path, change: Any = None, compression: int = zipfile.ZIP_STORED, **files: bytes) -> None:
-    """Change the JSON of a zip, and other files in it."""
-    with zipfile.ZipFile(path) as archive:
-        content = {name: archive.read(name) for name in archive.namelist()} | files
-    data = json.loads(content["data"])
-    if change is not None:
-        change(data)
-    with zipfile.ZipFile(path, "w", compression) as archive:
-        for name, value in (content | {"data": json.dumps(data).encode()}).items():
-            archive.writestr(name, value)
 
 
 @pytest.fixture

@@ -187,7 +187,8 @@ def test_a_run_gets_its_hashes_when_it_ends(tmp_path: Path, monkeypatch: pytest.
     made = read_run(tmp_path / "ppo" / "Nav2D-v0_1")
     listed = json.loads((made.folder / HASHES_NAME).read_bytes())["sha256"]
     assert set(listed) == {"0.monitor.csv", "1.monitor.csv", "evaluations.npz", "Nav2D-v0/args.yml",
-                           "Nav2D-v0/config.yml", "Nav2D-v0/command.txt", "Nav2D-v0/method.json"}  # fmt: skip
+                           "Nav2D-v0/config.yml", "Nav2D-v0/command.txt", "Nav2D-v0/method.json",
+                           "Nav2D-v0/vecnormalize.pkl"}  # fmt: skip
     evaluate_final(made.folder, 1)
     assert "final_evaluations.npz" in result_names(made.folder) and read_run(made.folder).final()
     # Killed in between: the next call makes it again.

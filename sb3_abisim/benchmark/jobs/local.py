@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-import zipfile
 from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -18,6 +17,7 @@ from tqdm import tqdm
 from sb3_abisim._version import __version__
 from sb3_abisim.benchmark.jobs.job import Job, is_by_other_code, is_done, manifest_path, read_manifest
 from sb3_abisim.benchmark.jobs.launch import kill, launch
+from sb3_abisim.common.arrays import ARRAY_ERRORS
 from sb3_abisim.common.files import folder_lock
 
 REFRESH_SECONDS = 1.0
@@ -219,7 +219,7 @@ def done_share(root: Path, job: Job) -> float:
         if job.kind == "run":
             (path,) = (root / "work" / job.name).glob("*/*/evaluations.npz")
             return min(1.0, float(np.load(path)["timesteps"][-1]) / job.cost)
-    except (OSError, ValueError, IndexError, EOFError, zipfile.BadZipFile):
+    except (OSError, *ARRAY_ERRORS):
         pass  # not begun, or read while it was written
     return 0.0
 

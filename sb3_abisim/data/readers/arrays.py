@@ -24,6 +24,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arrays import ARRAY_ERRORS
 from sb3_abisim.common.spaces import fit_actions
 from sb3_abisim.data.copies import ImageLayout
 from sb3_abisim.data.format import CUT, TERMINATED, TRUNCATED
@@ -42,7 +43,7 @@ OBSERVATIONS, ACTIONS = "observations", "actions"
 TERMINATIONS, TRUNCATIONS, EPISODE_ENDS = "terminations", "truncations", "episode_ends"
 FACTOR_PREFIX = "factor_"
 # Arrays of .npz files are read into memory; those of .npy files are mapped.
-MAX_UNPACKED_BYTES = 2**32
+MAX_UNPACKED_BYTES = 2**29
 # Deflate makes nothing smaller than this.
 _DEFLATE_RATIO = 1032
 _READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -271,7 +272,7 @@ class _Archive(_Part):
                     _check_header(file, member.file_size, where)
                 with archive.open(member) as file:
                     return np.lib.format.read_array(file, allow_pickle=False)
-        except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError) as error:
+        except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, NotImplementedError) as error:
             raise ValueError(f"{where} cannot be read ({error}); write it again with numpy.savez") from None
 
 
@@ -280,7 +281,7 @@ def _check_header(file: IO[bytes], size: int, where: str) -> None:
     try:
         version = np.lib.format.read_magic(file)
         shape, _, dtype = _READ_HEADER[version](file)
-    except (ValueError, KeyError, EOFError) as error:
+    except ARRAY_ERRORS as error:
         raise ValueError(f"{where} is no array of NumPy's ({error}); write it with numpy.save") from None
     if dtype.hasobject:
         raise ValueError(f"{where} holds Python objects, and to unpickle them can run code; save it as numbers")

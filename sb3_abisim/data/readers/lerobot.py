@@ -28,6 +28,7 @@ from sb3_abisim.data.format import TRUNCATED, from_json_file
 from sb3_abisim.data.importing import CHANNELS_KEY, LEFT_OUT_KEY, LOSSY_KEY
 from sb3_abisim.data.recorded import find_action_space, recorded_actions, recorded_layout
 from sb3_abisim.data.writer import Segment, check_folder, write_dataset
+from sb3_abisim.envs.backgrounds.video_frames import open_container
 from sb3_abisim.registry import register_reader
 
 ACTION = "action"
@@ -240,10 +241,10 @@ class _Recording:
 
         video = self.episodes[0].video
         try:
-            with av.open(str(video), metadata_errors="ignore") as container:
+            with open_container(video) as container:
                 context = container.streams.video[0].codec_context
                 shape, codec = (context.height, context.width, 3), context.codec.canonical_name
-        except (av.FFmpegError, IndexError) as error:
+        except (av.FFmpegError, IndexError, AttributeError) as error:
             raise ValueError(f"{video} cannot be decoded ({error}); download it again") from None
         # What the axes are called is not always true.
         if self.shape not in (shape, (shape[2], *shape[:2])):
@@ -297,12 +298,14 @@ def _read_table(path: Path, names: list[str]) -> dict[str, NDArray[Any]]:
     import pyarrow.parquet
 
     try:
-        # Column by column: names with dots are otherwise taken for nested ones.
-        table = pyarrow.parquet.ParquetFile(path)
-        missing = [name for name in names if name not in table.schema_arrow.names]
-        if missing:
-            raise ValueError(f"there is no column {missing[0]!r}")
-        return {name: _to_numpy(pyarrow, name, table.read(columns=[name]).column(name)) for name in names}
+        # An open file: a name such as http:a would be taken for an address.
+        with path.open("rb") as file:
+            table = pyarrow.parquet.ParquetFile(file)
+            missing = [name for name in names if name not in table.schema_arrow.names]
+            if missing:
+                raise ValueError(f"there is no column {missing[0]!r}")
+            # Column by column: names with dots are otherwise taken for nested ones.
+            return {name: _to_numpy(pyarrow, name, table.read(columns=[name]).column(name)) for name in names}
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise ValueError(f"{path} cannot be read as LeRobot writes it ({error}); download it again") from None
 
@@ -360,7 +363,7 @@ def _decoded(path: Path, begin: float | None, end: float) -> Iterator[tuple[floa
     import av
 
     try:
-        with av.open(str(path), metadata_errors="ignore") as container:
+        with open_container(path) as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             if begin is not None and begin > 0 and stream.time_base:
@@ -371,7 +374,7 @@ def _decoded(path: Path, begin: float | None, end: float) -> Iterator[tuple[floa
                 if frame.time > end:
                     return
                 yield frame.time, frame
-    except (av.FFmpegError, IndexError) as error:
+    except (av.FFmpegError, IndexError, AttributeError) as error:
         raise ValueError(f"{path} cannot be decoded ({error}); download it again") from None
 
 

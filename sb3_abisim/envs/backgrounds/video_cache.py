@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arrays import ARRAY_ERRORS
 from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.envs.backgrounds.clips import FRAME_SHAPE, SIZE, Backgrounds, Clip, array_hash
@@ -68,7 +69,7 @@ class _Entry:
             frames = _map(self.frames_path)
             if len(frames) != note["n_frames"] or array_hash(frames) != note["sha256"]:
                 return None
-        except (OSError, EOFError, ValueError, KeyError, TypeError):
+        except (OSError, *ARRAY_ERRORS):
             return None
         load = partial(_map, self.frames_path)
         return Clip(self.source.name, self.source.group, len(frames), note["sha256"], load)

@@ -6,6 +6,7 @@ trimmed counts frames that are not shown; it is complete if its last frame ends 
 """
 
 import contextlib
+import gc
 import importlib
 import itertools
 import re
@@ -25,8 +26,19 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
+# Of a frame: 8K video has 33 million.
+MAX_FRAME_PIXELS = 34_000_000
+# Of all frames of a file together: that many and more by its size, which no encoder comes near.
+_MAX_PIXELS, _MAX_PIXELS_PER_BYTE = 2_000_000_000, 10_000
+# A frame of PyAV and its side data refer to each other: it stays in memory until Python looks for such circles.
+_PIXELS_BEFORE_COLLECTION, _LEAST_ROW = 32_000_000, 128
 # What is opened is a file of these formats: no playlist and no list of files, which may name others or the network.
-_OPTIONS = {"protocol_whitelist": "none", "format_whitelist": "mov,matroska,avi,gif,ogg,mpeg,mpegvideo"}
+_OPTIONS = {
+    "protocol_whitelist": "none",
+    "format_whitelist": "mov,matroska,avi,gif,ogg,mpeg,mpegvideo",
+    # Larger ones are left without a size, before memory is taken for them.
+    "max_pixels": str(MAX_FRAME_PIXELS),
+}
 # From the display matrix, of which a row says where an axis goes, to Pillow's transposition.
 _TRANSPOSITIONS = {
     (1, 0, 0, 1): None,
@@ -41,8 +53,14 @@ _TRANSPOSITIONS = {
 
 
 @contextlib.contextmanager
-def _open(path: Path) -> Iterator[Any]:
-    """A container. It is given an open file: a name such as ``http:a.mp4`` would be taken for an address."""
+def open_container(path: Path) -> Iterator[Any]:
+    """A video file as a container of PyAV, which reads this file and nothing else.
+
+    It is given an open file: a name such as ``http:a.mp4`` would be taken for an address.
+
+    :param path: the file
+    :raises av.FFmpegError: if it is none of the formats that are read
+    """
     # Titles and the like may be in any encoding.
     av = importlib.import_module("av")
     with path.open("rb") as file, av.open(file, options=dict(_OPTIONS), metadata_errors="ignore") as container:
@@ -59,10 +77,11 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
     :raises ImportError: if the decoder is not installed
     """
     av = importlib.import_module("av")
-    count, end, length = 0, 0.0, None
+    count, end, length, n_pixels = 0, 0.0, None, 0
+    most = _MAX_PIXELS + _MAX_PIXELS_PER_BYTE * path.stat().st_size
     try:
         is_whole = require_whole(path)
-        with _open(path) as container:
+        with open_container(path) as container:
             stream = _video_stream(container, path)
             promised, share = _promise(container, path)
             if promised is None and not is_whole:
@@ -78,6 +97,14 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
                     raise ClipError(f"frame {count} of {path} is damaged; replace the file or remove it")
                 yield _upright(frame, aspect, path)
                 count += 1
+                # Rows are padded in memory.
+                before, n_pixels = n_pixels, n_pixels + max(frame.width, _LEAST_ROW) * frame.height
+                if n_pixels > most:
+                    raise ClipError(
+                        f"{path} holds more than {most} pixels in so small a file; scale it down or remove it"
+                    )
+                if n_pixels // _PIXELS_BEFORE_COLLECTION > before // _PIXELS_BEFORE_COLLECTION:
+                    gc.collect()
                 if length is not None and frame.pts is not None:
                     end = float((frame.pts + frame.duration) * frame.time_base)
     except av.FFmpegError as error:
@@ -94,7 +121,8 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
 
 def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", float]:
     """A frame as it is shown, and the aspect of its pixels then."""
-    image = frame.to_image()
+    # Its own to_image keeps more of them in memory.
+    image = importlib.import_module("PIL.Image").fromarray(frame.to_ndarray(format="rgb24"))
     matrix = next((data for data in frame.side_data if data.type.name == "DISPLAYMATRIX"), None)
     if matrix is None:
         return image, aspect
@@ -117,6 +145,12 @@ def _video_stream(container: Any, path: Path) -> Any:
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
         raise ClipError(f"{path} holds no video{' but a cover' * bool(container.streams.video)}; remove it")
+    # A stream that no decoder is known for has no size at all.
+    if not (getattr(streams[0], "width", 0) and getattr(streams[0], "height", 0)):
+        raise ClipError(
+            f"{path} has frames of over {MAX_FRAME_PIXELS} pixels, or of a kind that is not known; scale it down: "
+            f"ffmpeg -i {path.name} -vf scale=640:-2 small.mp4"
+        )
     return streams[0]
 
 
@@ -172,7 +206,7 @@ def expected_frames(source: Source) -> int:
         return 0
     av = importlib.import_module("av")
     try:
-        with _open(source.path) as container:
+        with open_container(source.path) as container:
             return _promise(container, source.path)[0] or 0
     except (ClipError, av.FFmpegError):
         return 0  # decoding will report what is wrong
@@ -185,6 +219,7 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
     for file in source.files:
         try:
             with image_module.open(file) as image:
+                _require_size(image, file)
                 if image.mode.startswith(("I", "F")):
                     raise ClipError(
                         f"{file} has more than 8 bits per value ({image.mode}); convert {source.path} to 8 bits"
@@ -202,11 +237,19 @@ def _decode_webp(path: Path) -> Iterator["Image.Image"]:
     require_whole(path)
     try:
         with image_module.open(path) as image:
+            _require_size(image, path)
             for index in range(image.n_frames):
                 image.seek(index)
                 yield image.convert("RGB")
     except (OSError, EOFError, SyntaxError, image_module.DecompressionBombError) as error:
         raise ClipError(f"{path} cannot be decoded ({error}); replace the file or remove it") from error
+
+
+def _require_size(image: "Image.Image", file: Path) -> None:
+    if image.width * image.height > MAX_FRAME_PIXELS:
+        raise ClipError(
+            f"{file} has {image.width} x {image.height} pixels, more than {MAX_FRAME_PIXELS}; scale it down"
+        )
 
 
 def _check_numbers(source: Source) -> None:

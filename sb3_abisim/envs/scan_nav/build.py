@@ -12,11 +12,12 @@ from sb3_abisim.envs.scan_nav.raster import Nearest, shade, solid_contour_pixels
 from sb3_abisim.envs.scan_nav.surfaces import Surface
 from sb3_abisim.envs.scan_nav.upright import LEVEL_BIN, UP_AXES, level_areas
 
-MAX_PIXELS = 64_000_000
+MAX_PIXELS = 16_000_000
 _PIXELS_AT_A_TIME = 2_000_000
 MIN_METERS_PER_PIXEL, MAX_METERS_PER_PIXEL = 0.0005, 1.0
-# Pixels that the faces may cover in all, each face for itself: as many layers of the map, and these in any case.
-MAX_LAYERS, FREE_FRAGMENTS, MAX_FRAGMENTS = 200, 100_000_000, 3_000_000_000
+# Pixels that the faces may cover in all, each face for itself: so many for each face, and these in any case, which take
+# a quarter of a minute. Large scans have many faces; a few that cover a map again and again are there to take time.
+FRAGMENTS_PER_FACE, FREE_FRAGMENTS, MAX_FRAGMENTS = 500, 200_000_000, 3_000_000_000
 # A level is a floor if it has this share of the largest level's area, and floors are this far apart.
 FLOOR_SHARE = 0.25
 FLOOR_DISTANCE = 1.5  # m
@@ -144,11 +145,7 @@ def map_fields(mesh: ScanMesh, source: str, settings: MapSettings) -> dict[str, 
     _check_layers(source, grid, width * height)
     seen = _look(grid, mesh.surfaces, faces_up, height, width, settings, others)
     shown, face, inside = seen["height"], seen["face"], seen["inside"]
-    pixels = np.flatnonzero(face >= 0)
-    orthophoto = np.zeros((height * width, 3), dtype=np.uint8)
-    for part in np.array_split(pixels, 1 + len(pixels) // _PIXELS_AT_A_TIME):
-        rows, columns = np.divmod(part, width)
-        orthophoto[part] = shade(grid, mesh.surfaces, face[part], columns + 0.5, rows + 0.5)
+    orthophoto = _colors(grid, mesh.surfaces, face, width)
     walkable = _walkable(
         seen["floor"].reshape(height, width), (seen["obstacle"] | inside).reshape(height, width), settings
     )
@@ -163,11 +160,23 @@ def map_fields(mesh: ScanMesh, source: str, settings: MapSettings) -> dict[str, 
     }
 
 
+def _colors(
+    grid: NDArray[np.float64], surfaces: tuple[Surface, ...], face: NDArray[Any], width: int
+) -> NDArray[np.uint8]:
+    """What each pixel shows, (n, 3)."""
+    orthophoto = np.zeros((len(face), 3), dtype=np.uint8)
+    for begin in range(0, len(face), _PIXELS_AT_A_TIME):
+        part = begin + np.flatnonzero(face[begin : begin + _PIXELS_AT_A_TIME] >= 0)
+        rows, columns = np.divmod(part, width)
+        orthophoto[part] = shade(grid, surfaces, face[part], columns + 0.5, rows + 0.5)
+    return orthophoto
+
+
 def _check_layers(source: str, grid: NDArray[np.float64], n_pixels: int) -> None:
     """Refuse what would take hours: faces that lie on top of one another hundreds of times."""
     size = np.ptp(grid, axis=1)
     covered = float((abs(_turn(grid)) / 2).sum() + 2 * len(range(15)) * size[:, :2].max(axis=1).sum())
-    granted = min(MAX_FRAGMENTS, max(MAX_LAYERS * n_pixels, FREE_FRAGMENTS))
+    granted = min(MAX_FRAGMENTS, max(FRAGMENTS_PER_FACE * len(grid), FREE_FRAGMENTS))
     if covered > granted:
         raise SceneError(
             f"{source}: its faces cover {covered:.3g} pixels in all, more than {granted:.3g}, of a map of {n_pixels}; "
@@ -205,9 +214,12 @@ def _look(
         obstacle[solid_contour_pixels(grid, surfaces, level + 1e-4, height, width)] = True
     # A sheet with two sides, such as a thin ceiling, is no solid: the tolerance keeps its upper side from winning.
     inside = top.height < ceiling.height - 1e-3
+    # In place: of a large map, each of these arrays takes a tenth of a gigabyte.
+    np.copyto(below.height, top.height, where=inside)
+    np.copyto(below.face, top.face, where=inside)
     return {
-        "height": np.where(inside, top.height, below.height),
-        "face": np.where(inside, top.face, below.face),
+        "height": below.height,
+        "face": below.face,
         "inside": inside,
         "floor": floor,
         "obstacle": obstacle,

@@ -7,13 +7,10 @@ and kept in a cache, or comes as a ``.npz`` file from elsewhere.
 
 import hashlib
 import json
-import math
 import os
 import sys
-import tokenize
 import warnings
 import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,11 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.arrays import read_npz
 from sb3_abisim.common.extras import require_extra
 from sb3_abisim.common.files import file_hash, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.common.vocabulary import current_scan_map
-from sb3_abisim.envs.scan_nav.build import MAX_PIXELS, MapSettings, map_fields
+from sb3_abisim.envs.scan_nav.build import MapSettings, map_fields
 from sb3_abisim.envs.scan_nav.files import SceneError, warn_missing
 from sb3_abisim.envs.scan_nav.mesh import load_mesh
 from sb3_abisim.envs.scan_nav.report import plausible_report, with_walkable
@@ -172,49 +170,35 @@ class ScanMap:
         if not path.is_file():
             raise SceneError(f"there is no scan map {path}; check the path")
         try:
-            _check_declared(path)
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
-                if str(arrays["format"]) != FORMAT:
-                    raise SceneError(f"{path} has the format {str(arrays['format'])!r}, this version reads {FORMAT!r}")
-                # Of the arrays that another program may have added, none is read.
-                names = current_scan_map({name: name for name in arrays.files})
-                origin = arrays["origin"]
-                return cls(
-                    arrays["orthophoto"],
-                    arrays["height"],
-                    arrays["walkable"],
-                    float(arrays[names["meters_per_pixel"]]),
-                    (float(origin[0]), float(origin[1])),
-                    str(arrays["source"]),
-                    current_scan_map(dict(json.loads(str(arrays["settings"])))),
-                )
+            with zipfile.ZipFile(path) as archive:
+                there = [name.removesuffix(".npy") for name in archive.namelist()]
+            names = current_scan_map({name: name for name in there})
+            # Of the arrays that another program may have added, none is read.
+            arrays = read_npz(path, names=[names[key] for key in _KEYS])
+            if str(arrays["format"]) != FORMAT:
+                raise SceneError(f"{path} has the format {str(arrays['format'])!r}, this version reads {FORMAT!r}")
+            origin = arrays["origin"]
+            return cls(
+                arrays["orthophoto"],
+                arrays["height"],
+                arrays["walkable"],
+                float(arrays[names["meters_per_pixel"]]),
+                (float(origin[0]), float(origin[1])),
+                str(arrays["source"]),
+                current_scan_map(dict(json.loads(str(arrays["settings"])))),
+            )
         except SceneError:
             raise
         except _UNREADABLE as error:
             raise SceneError(f"{path} is not a scan map ({error}); copy or write it again") from error
 
 
-# What NumPy raises for damaged files, by where the damage is.
+_KEYS = ("format", "orthophoto", "height", "walkable", "meters_per_pixel", "origin", "source", "settings")
+# Beside what read_npz says: of parts that are there and are something else.
 _UNREADABLE = (
-    OSError, EOFError, KeyError, ValueError, IndexError, TypeError, RuntimeError, MemoryError, zipfile.BadZipFile,
-    zlib.error, tokenize.TokenError, SyntaxError, AttributeError, OverflowError,
+    OSError, KeyError, ValueError, IndexError, TypeError, AttributeError, RuntimeError, OverflowError,
+    zipfile.BadZipFile,
 )  # fmt: skip
-
-
-def _check_declared(path: Path) -> None:
-    """Refuse a file whose arrays would be larger than any map, before one is unpacked."""
-    with zipfile.ZipFile(path) as archive:
-        for entry in (each for each in archive.infolist() if each.filename.endswith(".npy")):
-            with archive.open(entry) as member:
-                version = np.lib.format.read_magic(member)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(member)
-            n_bytes = math.prod(shape) * dtype.itemsize
-            if n_bytes > 4 * MAX_PIXELS:
-                raise SceneError(
-                    f"{path} declares {n_bytes} bytes of {entry.filename}, more than any map of {MAX_PIXELS} pixels; "
-                    "make it again with larger pixels"
-                )
 
 
 def _settings(settings: dict[str, Any]) -> MapSettings:

@@ -1,7 +1,7 @@
 """Scan files as triangles with colors: everything that can be wrong with a file is found here.
 
 A :class:`ScanMesh` is z-up, in meters. Files are read by our own readers, which take what they know
-and refuse everything else (docs/limits.md); trimesh is a second reader in the tests.
+and refuse everything else (docs/scan_files.md); trimesh is a second reader in the tests.
 """
 
 import os

@@ -19,6 +19,8 @@ _HARMLESS = re.compile(
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-boost": 1, "-texres": 1, "-imfchan": 1, "-bm": 1, "-clamp": 1, "-cc": 1,
             "-type": 1, "-mm": 2}  # fmt: skip
 _VECTORS = ("-o", "-s", "-t")
+# Of a statement; its words are taken one by one.
+_MAX_LETTERS = 4096
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
 
@@ -82,6 +84,10 @@ class _Reader:
         return SceneError(f"{self._files.path}: its material library {self._found} {what}")
 
     def take(self, key: str, value: str) -> None:
+        if len(value) > _MAX_LETTERS:
+            raise self._bad(
+                f"has a statement {key[:20]!r} of {len(value)} letters, more than {_MAX_LETTERS}; shorten it"
+            )
         if key == "newmtl":
             name = material_name(value)
             if name in self.statements:

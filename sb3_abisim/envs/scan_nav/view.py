@@ -1,6 +1,7 @@
 """Observations of ScanNav: parts of a map, with the agent rendered on them."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,9 @@ from numpy.typing import NDArray
 from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.map import ScanMap
 
-MAX_VIEW_PIXELS = 64_000_000  # of a whole scene
+MAX_VIEW_PIXELS = 16_000_000  # of a whole scene
+# Columns that are averaged together, and what is no part of another pixel.
+_BLOCK, _ROUNDING = 256, 1e-9
 CAMERA_HEIGHT = 3.0  # m above the floor
 MAX_DEPTH = 10.0  # m, Habitat's
 YELLOW, MAGENTA = (255, 214, 0), (255, 0, 200)
@@ -45,37 +48,46 @@ class SceneView:
                 f"{scan.source} at {self.pitch:.3g} m per pixel has {n_pixels:.3g} pixels, more than "
                 f"{MAX_VIEW_PIXELS}; lower image_size, raise view_size, or check the map's meters_per_pixel"
             )
-        surface = ~np.isnan(scan.height)
-        above = np.nan_to_num(scan.height)
-        nearness = np.where(surface, np.clip((CAMERA_HEIGHT - above) / CAMERA_HEIGHT, 0, 1), 0)
-        meters = np.where(surface, np.clip(CAMERA_HEIGHT - above, 0, MAX_DEPTH) / MAX_DEPTH, 0)
-        channels = [*np.moveaxis(scan.orthophoto, -1, 0), 255 * nearness, meters]
-        ratio = self.pitch / scan.meters_per_pixel
-        averaged = [area_means(np.asarray(c, dtype=np.float64), ratio) for c in channels]
-        border = image_size // 2
-        padded = np.pad(np.stack(averaged), ((0, 0), (border, border), (border, border)))
+        ratio, border = self.pitch / scan.meters_per_pixel, image_size // 2
+        shape = [math.ceil(n / ratio - _ROUNDING) + 2 * border for n in scan.walkable.shape]
         # uint8 (4, ...): red, green, blue, depth in 255 parts of the camera's height.
-        self.rgbd = np.rint(padded[:4]).astype(np.uint8)
+        self.rgbd = np.zeros((4, *shape), np.uint8)
         # float32, Habitat's depth: meters / MAX_DEPTH.
-        self.depth = padded[4].astype(np.float32)
+        self.depth = np.zeros(shape, np.float32)
+        inner = slice(border, shape[0] - border), slice(border, shape[1] - border)
+        # One at a time: a large map leaves no memory for all of them.
+        for index, channel in enumerate(np.moveaxis(scan.orthophoto, -1, 0)):
+            self.rgbd[index][inner] = np.rint(area_means(channel, ratio))
+        surface, above = ~np.isnan(scan.height), np.nan_to_num(scan.height)
+        nearness = np.where(surface, np.clip((CAMERA_HEIGHT - above) / CAMERA_HEIGHT, 0, 1), 0)
+        self.rgbd[3][inner] = np.rint(area_means(255 * nearness, ratio))
+        del nearness
+        meters = np.where(surface, np.clip(CAMERA_HEIGHT - above, 0, MAX_DEPTH) / MAX_DEPTH, 0)
+        self.depth[inner] = area_means(meters, ratio)
 
 
-def area_means(channel: NDArray[np.float64], ratio: float) -> NDArray[np.float64]:
+def area_means(channel: NDArray[Any], ratio: float) -> NDArray[np.float64]:
     """Means over squares of ``ratio`` x ``ratio`` pixels, which need not be a whole number; beyond the channel is 0.
 
-    :param channel: (height, width)
+    :param channel: numbers, (height, width)
     :param ratio: size of a square, in pixels
     :return: (ceil(height / ratio), ceil(width / ratio))
     """
     for _ in range(2):
-        total = np.pad(np.cumsum(channel, axis=0), ((1, 1), (0, 0)), mode="edge")
-        total[0] = 0
-        n = len(channel)
-        edges = np.minimum(np.arange(int(np.ceil(n / ratio - 1e-9)) + 1) * ratio, n)
-        whole = edges.astype(np.int64)
-        at_edges = total[whole] + (edges - whole)[:, None] * (total[whole + 1] - total[whole])
-        channel = (np.diff(at_edges, axis=0) / ratio).T
+        blocks = [channel[:, k : k + _BLOCK] for k in range(0, channel.shape[1], _BLOCK)]
+        channel = np.concatenate([_means_of_columns(block, ratio) for block in blocks], axis=1).T
     return channel
+
+
+def _means_of_columns(channel: NDArray[Any], ratio: float) -> NDArray[np.float64]:
+    total = np.pad(np.cumsum(channel, axis=0, dtype=np.float64), ((1, 1), (0, 0)), mode="edge")
+    total[0] = 0
+    n = len(channel)
+    edges = np.minimum(np.arange(math.ceil(n / ratio - _ROUNDING) + 1) * ratio, n)
+    whole = edges.astype(np.int64)
+    at_edges = total[whole] + (edges - whole)[:, None] * (total[whole + 1] - total[whole])
+    means: NDArray[np.float64] = np.diff(at_edges, axis=0) / ratio
+    return means
 
 
 class MarkerPainter:

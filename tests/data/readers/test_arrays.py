@@ -224,6 +224,10 @@ def npy(array: np.ndarray, **changes: Any) -> bytes:
     return file.getvalue() + array.tobytes()
 
 
+# NumPy reads headers as Python, whose tokenizer raises an error of its own.
+UNENDING = b"\x93NUMPY\x01\x00\x40\x00" + b"(" * 60
+
+
 @pytest.mark.parametrize("kind", ["npz", "folder"])
 @pytest.mark.parametrize(
     ("content", "message"),
@@ -234,8 +238,9 @@ def npy(array: np.ndarray, **changes: Any) -> bytes:
         (npy(np.zeros(3), descr="|O"), "holds Python objects"),
         (b"no array", "no array of NumPy's"),
         (pickle.dumps(frames(4)), "no array of NumPy's"),
+        (UNENDING, "no array of NumPy's"),
     ],
-    ids=["a terabyte", "too short", "cut off", "objects", "text", "pickle"],
+    ids=["a terabyte", "too short", "cut off", "objects", "text", "pickle", "brackets"],
 )
 def test_what_a_header_declares_is_not_believed(kind: str, content: bytes, message: str, tmp_path: Path) -> None:
     members = {"observations": content, "actions": npy(np.arange(3))}
@@ -261,10 +266,10 @@ def test_what_an_archive_declares_is_not_believed(tmp_path: Path, monkeypatch: p
     content = (tmp_path / "a.npz").read_bytes()
     true = len(npy(frames(4)))
     # The size before packing stands in the local header and in the directory.
-    forged = content.replace(true.to_bytes(4, "little"), (2**31).to_bytes(4, "little"))
+    forged = content.replace(true.to_bytes(4, "little"), (2**28).to_bytes(4, "little"))
     assert forged != content
     (tmp_path / "forged.npz").write_bytes(forged)
-    with pytest.raises(ValueError, match=r"observations in .* declares 2147483648 bytes in"):
+    with pytest.raises(ValueError, match=r"observations in .* declares 268435456 bytes in"):
         read(tmp_path / "forged.npz", tmp_path / "d")
     monkeypatch.setattr(reader_module, "MAX_UNPACKED_BYTES", 100)
     with pytest.raises(ValueError, match=r"more than 100; save it as observations\.npy in a folder"):

@@ -312,3 +312,20 @@ def test_a_missing_package_names_the_command(
     with pytest.raises(SystemExit) as exit_info:
         main(["import", "lerobot", str(written), "-o", str(tmp_path / "d")])
     assert exit_info.value.code == 2 and "pip install 'sb3_abisim[lerobot]'" in capsys.readouterr().err
+
+
+def test_a_folder_with_the_name_of_an_address_is_a_folder(
+    written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(written, tmp_path / "http:set")
+    monkeypatch.chdir(tmp_path)
+    first, second = read(Path("http:set"), tmp_path / "a"), read(written, tmp_path / "b")
+    assert first.frames(np.arange(3)).tolist() == second.frames(np.arange(3)).tolist()
+
+
+def test_a_list_of_files_in_place_of_a_video_is_refused(source: Path, tmp_path: Path) -> None:
+    for path in source.rglob("*.mp4"):
+        other = path.rename(path.with_suffix(".other"))
+        path.write_text(f"ffconcat version 1.0\nfile {other.name}\n")
+    with pytest.raises(ValueError, match=r"file-000\.mp4 cannot be decoded"):
+        read(source, tmp_path / "a")

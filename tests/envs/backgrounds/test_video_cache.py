@@ -41,6 +41,17 @@ class TestCache:
         raw[-100] ^= 1
         assert path.read_bytes() == bytes(raw)
 
+    @pytest.mark.parametrize("harm", [(10, bytes(60)), (10, b"(" * 60), (11, b"-"), (20, b"9" * 20)])
+    def test_an_entry_with_any_header_is_decoded_again(self, folder, cache, harm):
+        two_folders(folder)
+        expected = shown(load_backgrounds(folder, "train"))
+        path = next(cache.glob("*.npy"))
+        raw, (start, content) = path.read_bytes(), harm
+        path.write_bytes(raw[:start] + content + raw[start + len(content) :])
+        video_cache.load_split.cache_clear()
+        assert np.array_equal(shown(load_backgrounds(folder, "train")), expected)
+        assert path.read_bytes() == raw
+
     def test_a_changed_video_is_not_taken_from_the_cache(self, folder):
         write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)
         before = [clips.content_hash for clips in both(folder)]

@@ -152,6 +152,36 @@ class TestDamage:
         with pytest.raises(ClipError, match=r"24 of 25 frames: there is none between frame32\.png and frame36"):
             load_backgrounds(folder)
 
+    def test_frames_that_are_too_large_are_refused_before_they_are_decoded(self, folder, monkeypatch):
+        assert video_frames._OPTIONS["max_pixels"] == str(video_frames.MAX_FRAME_PIXELS)
+        monkeypatch.setattr(video_frames, "MAX_FRAME_PIXELS", 96 * 72 - 1)
+        monkeypatch.setitem(video_frames._OPTIONS, "max_pixels", str(96 * 72 - 1))
+        path = write_video(folder / "a.mp4", 1)
+        write_video(folder / "b.mp4", 2)
+        with pytest.raises(ClipError, match=r"\.mp4 has frames of over 6911 pixels, .*; scale it down: ffmpeg -i"):
+            list(video_frames.decode_video(path))
+        write_frames(folder / "c", size=(96, 72))
+        write_frames(folder / "d", 1, size=(96, 72))
+        path.unlink(), (folder / "b.mp4").unlink()
+        with pytest.raises(ClipError, match=r"frame0\.png has 96 x 72 pixels, more than 6911; scale it down"):
+            load_backgrounds(folder)
+
+    def test_more_pixels_than_so_small_a_file_can_hold(self, folder, monkeypatch):
+        path = write_video(folder / "a.mp4", 1)
+        monkeypatch.setattr(video_frames, "_MAX_PIXELS_PER_BYTE", 0)
+        monkeypatch.setattr(video_frames, "_MAX_PIXELS", 63 * 128 * 72)
+        with pytest.raises(ClipError, match="holds more than 580608 pixels in so small a file"):
+            list(video_frames.decode_video(path))
+        monkeypatch.setattr(video_frames, "_MAX_PIXELS", 64 * 128 * 72)
+        assert len(list(video_frames.decode_video(path))) == 64
+
+    def test_decoded_frames_do_not_pile_up(self, folder, monkeypatch):
+        collected = []
+        monkeypatch.setattr(video_frames.gc, "collect", lambda: collected.append(1))
+        monkeypatch.setattr(video_frames, "_PIXELS_BEFORE_COLLECTION", 8 * 128 * 72)
+        assert len(list(video_frames.decode_video(write_video(folder / "a.mp4", 1)))) == 64
+        assert len(collected) == 8
+
     @pytest.mark.parametrize("missing", ["av", "PIL"])
     def test_decoder_not_installed(self, folder, monkeypatch, missing):
         write_video(folder / "a.mp4", 1), write_video(folder / "b.mp4", 2)

@@ -188,7 +188,7 @@ SHAPES = {
     "doll.glb": (lambda: scaled(0.2), {}, "no floor: its largest horizontal level has"),
     "cube.glb": (lambda: trimesh.Scene([box(0, 0, 3, 3, 0, 3, (1, 1, 1))]), {}, r"could stand.*up='y' or up='z'"),
     "tilted.glb": (tilted, {}, "no floor: its largest horizontal level"),
-    "fine.glb": (house, {"meters_per_pixel": 0.0005}, r"larger than 64 million; raise meters_per_pixel from 0.0005 to"),
+    "fine.glb": (house, {"meters_per_pixel": 0.0005}, r"larger than 16 million; raise meters_per_pixel from 0.0005 to"),
     "narrow.glb": (lambda: trimesh.Scene([floor(size=(0.3, 9))]), {}, r"only 0\.\d+ m2 .* can be walked on"),
 }
 

@@ -87,7 +87,7 @@ def test_a_pickle_holds_no_memory_that_was_never_written(room):
 )
 def test_settings_are_bounded_before_memory_is_taken(room, kwargs, message):
     if message is None:
-        message, room = "has .* pixels, more than 64000000; lower image_size, raise view_size", empty_room(30.0, 30.0)
+        message, room = "has .* pixels, more than 16000000; lower image_size, raise view_size", empty_room(30.0, 30.0)
     with pytest.raises(ValueError, match=message):
         ScanNavEnv(scenes=room, **kwargs)
 

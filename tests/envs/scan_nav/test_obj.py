@@ -160,6 +160,7 @@ def test_a_map_of_transparency_makes_holes(folder):
         (TEXTURED, "newmtl m\nKd 1 1 1\nnewmtl m\nKd 0 0 0\n", "two materials of the name 'm'"),
         (TEXTURED.replace(FACE, "f 1/1 2/2 3 4\n"), "newmtl m\nmap_Kd a.png\n", "at some of their corners"),
         (TEXTURED, "newmtl m\nmap_Kd a.png\nmap_d gone.png\n", "refers to gone.png, its transparency"),
+        (TEXTURED, "newmtl m\nmap_Kd " + "-o 1 " * 1000 + "\n", "statement 'map_kd' of 4999 letters, more than 4096"),
         ("v 0 0 0\0\n", None, "is not a text in UTF-8"),
     ],
     ids=lambda value: str(value)[-40:],
