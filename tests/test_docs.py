@@ -57,11 +57,9 @@ def test_the_page_of_environments_says_what_they_and_the_results_say() -> None:
     assert made == (ROOT / "docs" / "environments.md").read_text(encoding="utf-8"), "tools/make_environments_page.py"
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("site")
+def build(folder: Path) -> Path:
+    """Make the site, a warning being an error."""
     words = ["-b", "html", "-q", "-W", "--keep-going", "-c", "docs", "-d", str(folder / "doctrees")]
-    # Warnings of deprecation inside of Sphinx and its theme are theirs.
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", *words, ".", str(folder / "html")], cwd=ROOT, capture_output=True, text=True
     )
@@ -105,12 +103,16 @@ class Page(HTMLParser):
             self.prose += data
 
 
-@pytest.fixture(scope="module")
-def built(site: Path) -> dict[Path, Page]:
-    return {path: Page(path.read_text(encoding="utf-8")) for path in sorted(site.rglob("*.html"))}
+def test_the_site(tmp_path: Path) -> None:
+    # One test: processes that run tests in parallel would each build it again.
+    site = build(tmp_path)
+    built = {path: Page(path.read_text(encoding="utf-8")) for path in sorted(site.rglob("*.html"))}
+    every_page_is_built_with_one_heading_and_nothing_of_its_source(site, built)
+    links_and_images_lead_somewhere(built)
+    the_reference_has_every_public_name(built, site)
 
 
-def test_every_page_is_built_with_one_heading_and_nothing_of_its_source(site: Path, built: dict[Path, Page]) -> None:
+def every_page_is_built_with_one_heading_and_nothing_of_its_source(site: Path, built: dict[Path, Page]) -> None:
     for page in PAGES:
         path = site / Path(page).with_suffix(".html")
         assert path in built, page
@@ -119,7 +121,7 @@ def test_every_page_is_built_with_one_heading_and_nothing_of_its_source(site: Pa
         assert not (raw := RAW.search(page.prose)), f"{path}: {page.prose[max(raw.start() - 40, 0) : raw.end() + 40]!r}"
 
 
-def test_links_and_images_of_the_site_lead_somewhere(built: dict[Path, Page]) -> None:
+def links_and_images_lead_somewhere(built: dict[Path, Page]) -> None:
     n_images = 0
     for path, page in built.items():
         for name in [*page.links, *page.images]:
@@ -134,7 +136,7 @@ def test_links_and_images_of_the_site_lead_somewhere(built: dict[Path, Page]) ->
     assert n_images > 20
 
 
-def test_the_reference_has_every_public_name(built: dict[Path, Page], site: Path) -> None:
+def the_reference_has_every_public_name(built: dict[Path, Page], site: Path) -> None:
     ids = set().union(*(page.ids for path, page in built.items() if path.is_relative_to(site / "docs" / "api")))
     for name in sb3_abisim.__all__:
         thing = getattr(sb3_abisim, name)
