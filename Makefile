@@ -51,8 +51,9 @@ type: setup  ## mypy in strict mode
 
 check: lint type test  ## all of the above that must be green
 
-docs: setup  ## the pages of docs/ as a site with the API's reference, into site/
-	$(BIN)/python -m mkdocs build --strict
+# The source folder is the repository, since the pages link into all of it.
+docs: setup  ## the pages of docs/ as a site with the API's reference, into site/; a warning is an error
+	$(BIN)/python -m sphinx -b html -W --keep-going -c docs -d build/doctrees . site
 
 bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
 	$(BIN)/python -m benchmarks.bench_envs
@@ -102,4 +103,4 @@ benchmark-smoke: setup  ## the same kinds of jobs and report with tiny budgets, 
 	$(BIN)/sb3-abisim benchmark -o benchmark-smoke $(SMOKE)
 
 clean:  ## remove the environment and caches
-	rm -rf $(VENV) $(VENV)-lowest .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	rm -rf $(VENV) $(VENV)-lowest .pytest_cache .mypy_cache .ruff_cache build site docs/api *.egg-info

@@ -10,10 +10,14 @@ ENCODERS = Path(__file__).parent.parent / "encoders"
 HEAD = """# Shipped encoders
 
 They were pretrained with the settings of `hyperparams/pretrain/` on uniformly random actions, with seed 0 and one
-thread. The model card beside each file (`.json`) holds the commands that made it, the hash of its data, the settings
-and all curves. Names in a card are those of the version that wrote it.
+thread. The model card beside each file holds the commands that made it, the hash of its data, the settings and all
+curves. Names in a card are those of the version that wrote it.
 
-`tools/make_encoder_table.py` makes this table of the cards. Results are those of the last row of the log, on the eval
+The names in the tables are what every command and `policy_kwargs` take for an encoder. `sb3-abisim doctor NAME` says
+what is in a file. What an encoder holds: [docs/figures.md](../docs/figures.md). What it does for RL:
+[docs/results.md](../docs/results.md). How to use one: [docs/encoders.md](../docs/encoders.md).
+
+`tools/make_encoder_table.py` makes the tables of the cards. Results are those of the last row of the log, on the eval
 split.
 
 * `accuracy` of `ssi` and `acro`: share of actions predicted from two observations one or k steps apart. For continuous
@@ -25,27 +29,39 @@ split.
   With `pairs: nearest`, the difference is relative to the base distance, as in training. `distance` is the mean.
 * `progress_r2` of `goal_progress`: coefficient of determination of the progress towards all goals. `value_loss` is the
   mean squared TD error of the values, which lie in 0..1.
+"""
+COLUMNS = """
+## {env_id}
 
-| encoder | transitions | updates | parameters | features | kB | result on the eval split |
-|---|---:|---:|---:|---:|---:|---|
+| encoder | method | transitions | updates | parameters | features | kB | result on the eval split |
+|---|---|---:|---:|---:|---:|---:|---|
 """
 
 
 def main() -> None:
-    """Write the table."""
+    """Write the page."""
     argparse.ArgumentParser(description=__doc__).parse_args()
-    rows = []
-    for path in sorted(ENCODERS.glob("*/*.json")):
-        card = read_card(path)
-        names = get_method(card["settings"]["objective"]).results
-        result = ", ".join(f"{name} {card['metrics'][f'eval/{name}']:.3g}" for name in names)
-        size = path.with_suffix(".safetensors").stat().st_size / 1000
-        rows.append(
-            f"| `{path.parent.name}/{path.stem}` | {card['dataset']['n_transitions']:,} | "
-            f"{card['settings']['n_updates']:,} | {card['n_parameters']:,} | {card['features_dim']} | {size:.0f} | "
-            f"{result} |"
-        )
-    (ENCODERS / "README.md").write_text(HEAD + "\n".join(rows) + "\n")
+    text = HEAD
+    for folder in sorted(path for path in ENCODERS.iterdir() if path.is_dir()):
+        text += COLUMNS.format(env_id=folder.name) + "".join(row(path) for path in sorted(folder.glob("*.json")))
+    (ENCODERS / "README.md").write_text(text)
+
+
+def row(path: Path) -> str:
+    """Of the table of an environment.
+
+    :param path: of a model card
+    """
+    card = read_card(path)
+    method = get_method(card["settings"]["objective"])
+    result = ", ".join(f"{name} {card['metrics'][f'eval/{name}']:.3g}" for name in method.results)
+    size = path.with_suffix(".safetensors").stat().st_size / 1000
+    name = f"{path.parent.name}/{path.stem}"
+    return (
+        f"| `{name}` ([card]({name}.json)) | [{method.label}](../docs/objectives/{method.name}.md) | "
+        f"{card['dataset']['n_transitions']:,} | {card['settings']['n_updates']:,} | {card['n_parameters']:,} | "
+        f"{card['features_dim']} | {size:.0f} | {result} |\n"
+    )
 
 
 if __name__ == "__main__":

@@ -67,6 +67,9 @@ def tables(found: dict[str, Any]) -> str:
         if part in found:
             table = _table(part, first, found[part]["rows"])
             blocks.append("\n\n".join([f"### {title}", textwrap.fill(text, 120), table, _how(found[part])]) + "\n")
+    missing = [title for part, (title, _, _) in _TITLES.items() if part not in found]
+    if missing:
+        blocks.append(f"Not counted at this scale yet: {', '.join(missing).lower()}.\n")
     return "\n".join(blocks)
 
 
@@ -86,7 +89,9 @@ def page(before: str, found: dict[str, Any]) -> str:
 def _how(part: dict[str, Any]) -> str:
     minutes = max(1, round(part["seconds"] / 60))
     scaled = "" if part["scale"] == 1 else f", scale {part['scale']:g}"
-    return f"Seed {part['seed']}{scaled}, {minutes} minutes of {part['machine']}."
+    # Written by hand into the file, where rows are not all of one run; a whole run leaves none.
+    note = f" {part['note']}" if "note" in part else ""
+    return textwrap.fill(f"Seed {part['seed']}{scaled}, {minutes} minutes of {part['machine']}.{note}", 120)
 
 
 def _table(part: str, first: str, rows: dict[str, Any]) -> str:

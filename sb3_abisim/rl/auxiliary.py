@@ -197,10 +197,9 @@ class AuxiliaryObjective(BaseCallback):
             learns = n_updates and model.num_timesteps > model.learning_starts
             return ReplaySteps(model.replay_buffer) if learns else None
         keys = list(self._terminal)
-        is_short = len(self._dones) * self.training_env.num_envs < self._history.n_least
         rollout = read_rollout(
             model.rollout_buffer, keys, model.action_space, model.policy.squash_output,
-            self._dones, self._terminal, model._last_obs, copy=is_short,
+            self._dones, self._terminal, model._last_obs,
         )  # fmt: skip
         self._history.add(rollout)
         return RolloutSteps.join(self._history.parts) if n_updates else None

@@ -223,7 +223,6 @@ def read_rollout(
     dones: list[NDArray[np.bool_]],
     terminal: dict[str | None, dict[tuple[int, int], NDArray[np.uint8]]],
     last: Any,
-    copy: bool,
 ) -> RolloutSteps:
     """The steps of a rollout that has just ended, before the algorithm has shuffled its buffer.
 
@@ -234,13 +233,11 @@ def read_rollout(
     :param dones: of each step, [n_envs]
     :param terminal: see :class:`RolloutSteps`
     :param last: the algorithm's last observations
-    :param copy: the buffer's observations, which it may write over later
     """
     assert not buffer.generator_ready, "the rollout is read before train(), which flattens it"
+    # No copies: the buffer makes new arrays for the next rollout.
     observations: Any = buffer.observations
     observed = {key: observations if key is None else observations[key] for key in keys}
-    if copy:
-        observed = {key: array.copy() for key, array in observed.items()}
     taken = executed_actions(space, buffer.actions, scaled, clipped=not scaled)
     newest = {key: np.array(last if key is None else last[key]) for key in keys}
     return RolloutSteps(observed, taken, np.array(dones, bool), terminal, newest)

@@ -267,6 +267,15 @@ def test_goals_follow_the_base(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not th.equal(goals[0], goals[1])
 
 
+def test_two_extractors_have_random_numbers_of_their_own() -> None:
+    model = build("PPO", other_sharing=True)
+    callback = AuxiliaryObjective("ssi", **SMALL)
+    model.learn(16, callback)
+    actor, critic = callback._trainers.values()
+    assert not th.equal(actor._randomness.state, critic._randomness.state)
+    assert actor._generator.bit_generator.state != critic._generator.bit_generator.state
+
+
 def test_nothing_of_the_log_collides_with_two_copies(capsys: pytest.CaptureFixture[str]) -> None:
     """Stable-Baselines3 shortens names for the terminal, and refuses two that become equal."""
     model = build("PPO", other_sharing=True, verbose=1)
@@ -500,5 +509,7 @@ def test_an_encoder_without_its_file_is_refused(tmp_path: Any) -> None:
         from extractor_inputs import build as build_pretrained
 
         model = build_pretrained("DQN", tmp_path / "absent.safetensors", freeze=False)
+    # Now, and not once it acts by its policy.
+    model.learning_starts = 1000
     with pytest.raises(FileNotFoundError, match="no pretrained weights"):
         model.learn(16, AuxiliaryObjective("ssi"))
