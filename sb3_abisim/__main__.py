@@ -12,7 +12,10 @@ from sb3_abisim.common.cli import PROGRAM
 # Command: the module whose ``main`` runs it, and what it does.
 COMMANDS = {
     "collect": ("sb3_abisim.data.collect", "collect transitions of an environment into a dataset"),
-    "data": ("sb3_abisim.data.command", "import a dataset from another format, or export one to Minari"),
+    "data": (
+        "sb3_abisim.data.command",
+        "import a dataset from another format, export one to Minari, or show what is in one",
+    ),
     "pretrain": ("sb3_abisim.pretraining.pretrain", "pretrain an encoder on a dataset"),
     "train": ("sb3_abisim.zoo.command", "train an agent: rl-zoo3's train with our methods for --conf-file"),
     "enjoy": ("sb3_abisim.zoo.command", "watch a trained agent: rl-zoo3's enjoy"),

@@ -24,6 +24,7 @@ ALWAYS_THERE = {"optuna"}
 CALLS: dict[str, list[tuple[str, str]]] = {
     "PIL": [
         ("scan", "gym.make('ScanNav-v0')"),
+        ("pages", "main(['data', 'show', 'folder', '-o', 'new.html'])"),
         ("plots", "main(['demo', '-o', 'new'])"),
         ("plots", "main(['record', 'run', '-o', 'new.gif'])"),
         ("video", "gym.make('DistractorPointMaze-v0', videos='clips')"),
@@ -38,7 +39,10 @@ CALLS: dict[str, list[tuple[str, str]]] = {
         ("hub", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--no-evidence'])"),
         ("hub", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--no-evidence', '-o', 'new'])"),
     ],
-    "jinja2": [("benchmark", "main(['benchmark', '-o', 'new'])")],
+    "jinja2": [
+        ("benchmark", "main(['benchmark', '-o', 'new'])"),
+        ("pages", "main(['data', 'show', 'folder', '-o', 'new.html'])"),
+    ],
     "matplotlib": [
         ("plots", "main(['demo', '-o', 'new'])"),
         ("plots", "main(['analyze', 'perturbation', '--images', 'new', '-n', '1'])"),

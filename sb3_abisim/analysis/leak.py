@@ -184,7 +184,8 @@ def leak_maps_of_data(path: str | Path, n_episodes: int, seed: int = 0) -> dict[
     n = min(len(starts), n_episodes * PER_EPISODE)
     starts = np.random.default_rng(seed).choice(starts, n, replace=False)
     obs, next_obs = dataset.frames(starts), dataset.frames(starts + 1)
-    return _both_audits(obs, dataset.actions(starts), next_obs, dataset.action_space)
+    audits = _both_audits(obs, dataset.actions(starts), next_obs, dataset.action_space)
+    return {"dataset_hash": dataset.hash, **audits}
 
 
 def _both_audits(

@@ -1,4 +1,4 @@
-"""``sb3-abisim data import`` and ``data export``: datasets from other formats, and to Minari."""
+"""``sb3-abisim data import``, ``data export`` and ``data show``: exchange datasets, and look at one."""
 
 import argparse
 import sys
@@ -18,10 +18,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not words or words[0] not in COMMANDS:
         # Help, or an error that lists the commands.
         example = "data import minari nav2d/random-v0 -o data/nav2d"
-        parser = make_parser("data", "Exchange datasets with other formats.", example)
-        commands = parser.add_subparsers(dest="command", required=True, metavar="import | export")
+        parser = make_parser("data", "Exchange datasets with other formats, or look at one.", example)
+        commands = parser.add_subparsers(dest="command", required=True, metavar="import | export | show")
         commands.add_parser("import", help="make a dataset folder of what something else has written")
         commands.add_parser("export", help="write a dataset folder into Minari's local store")
+        commands.add_parser("show", help="write one HTML page of what is in a dataset")
         parser.parse_args(words)
         return
     make, function = COMMANDS[words[0]]
@@ -70,4 +71,26 @@ def _export(args: argparse.Namespace) -> None:
     print(f"{args.dataset_id}: exported from {args.folder}; rewards were not recorded and are all 0")
 
 
-COMMANDS = {"import": (_import_parser, _import), "export": (_export_parser, _export)}
+def _show_parser() -> argparse.ArgumentParser:
+    parser = make_parser(
+        "data show",
+        "Write one HTML page of what is in a dataset: episodes, actions, coverage of states, lengths, duplicates.",
+        "data show data/nav2d -o nav2d.html",
+    )
+    parser.add_argument("folder", metavar="DIR", help="a dataset's folder")
+    parser.add_argument("-o", "--output", required=True, metavar="FILE", help="the page (.html)")
+    parser.add_argument("--leak", metavar="JSON", help="numbers of sb3-abisim analyze leak --data DIR")
+    return parser
+
+
+def _show(args: argparse.Namespace) -> None:
+    from sb3_abisim.data.show import show
+
+    print(show(args.folder, args.output, args.leak))
+
+
+COMMANDS = {
+    "import": (_import_parser, _import),
+    "export": (_export_parser, _export),
+    "show": (_show_parser, _show),
+}

@@ -121,6 +121,14 @@ class TransitionDataset:
         """Per frame: 0 within a segment, and on its last frame 1 terminated, 2 truncated, 3 cut by a shard's end."""
         return self._ends.copy()
 
+    def segments(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Episodes, or the parts that shards cut them into.
+
+        :return: per segment the first frame, the last frame, and the segment that it goes on with (-1 where it begins
+            an episode), each int64
+        """
+        return np.concatenate([[0], self._last[:-1] + 1]), self._last.copy(), self._before.copy()
+
     def valid_starts(self, k: int = 1, split: Split | None = None) -> NDArray[np.int64]:
         """The frames t for which frame t + k belongs to the same episode, ascending.
 

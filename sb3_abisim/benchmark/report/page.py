@@ -1,6 +1,5 @@
 """The report of a benchmark: PNG, CSV and one HTML page that needs no other file."""
 
-import base64
 import csv
 import io
 import math
@@ -15,7 +14,8 @@ from sb3_abisim.benchmark.report.figures import MINUS, plot, split_order, thresh
 from sb3_abisim.benchmark.report.groups import WITHOUT_SPLITS, Group, split_label
 from sb3_abisim.benchmark.report.tables import Comparison, Row, compare
 from sb3_abisim.common.files import write_atomic
-from sb3_abisim.common.text import printable, spreadsheet_cell
+from sb3_abisim.common.page import png_source, render_page
+from sb3_abisim.common.text import spreadsheet_cell
 from sb3_abisim.registry import get_traits, methods
 from sb3_abisim.zoo.runs import Run, is_deterministic
 
@@ -77,12 +77,13 @@ def render(comparison: Comparison, images: dict[str, bytes]) -> str:
     :param comparison: its numbers
     :param images: name to PNG file
     """
-    import jinja2
-
-    environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=_shown
-    )
-    environment.filters |= {
+    template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
+    sources = {name: png_source(data) for name, data in images.items()}
+    labels = list(dict.fromkeys(label for group in comparison.groups.values() for label in group))
+    known, names = methods(), [label.removesuffix(",frozen") for label in labels]
+    unreached = _unreached(comparison)
+    unreached_keys = {(row["env_id"], row["threshold"]) for row in unreached}
+    filters: dict[str, Any] = {
         "number": _number,
         "threshold": threshold_text,
         "place": _place,
@@ -90,13 +91,9 @@ def render(comparison: Comparison, images: dict[str, bytes]) -> str:
         "ratio": _ratio,
         "minutes": _minutes,
     }
-    template = environment.from_string(resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
-    sources = {name: f"data:image/png;base64,{base64.b64encode(data).decode()}" for name, data in images.items()}
-    labels = list(dict.fromkeys(label for group in comparison.groups.values() for label in group))
-    known, names = methods(), [label.removesuffix(",frozen") for label in labels]
-    unreached = _unreached(comparison)
-    unreached_keys = {(row["env_id"], row["threshold"]) for row in unreached}
-    return template.render(
+    return render_page(
+        template,
+        filters,
         comparison=comparison,
         images=sources,
         cards=[_card(comparison, env_id) for env_id in comparison.groups],
@@ -113,11 +110,6 @@ def render(comparison: Comparison, images: dict[str, bytes]) -> str:
         n_resamples=statistics.N_RESAMPLES,
         version=__version__,
     )
-
-
-def _shown(value: Any) -> Any:
-    """A text as plain text; HTML in it is escaped."""
-    return printable(value, "\n") if type(value) is str else value
 
 
 def _acting(comparison: Comparison) -> str:
