@@ -158,21 +158,23 @@ def factor_parts(dataset: TransitionDataset, index: NDArray[np.int64]) -> list[d
 
     :param dataset: any
     :param index: of frames, ascending
-    :return: per factor: name, shape, n_distinct, low, high, and ``chart`` (one number) or ``map`` (two)
+    :return: per factor: name, shape, n_distinct, low, high, and of one that varies ``chart`` (one number) or ``map``
+        (two)
     """
     parts = []
     for name, values in _some_factors(dataset, index).items():
         rows = values.reshape(len(values), -1)
         numeric = rows.astype(np.float64)
+        n_distinct = len(np.unique(rows, axis=0))
         finite = bool(np.isfinite(numeric).all()) and rows.size > 0
         part: dict[str, Any] = {
             "name": name,
             "shape": " x ".join(map(str, values.shape[1:])) or "1",
-            "n_distinct": len(np.unique(rows, axis=0)),
+            "n_distinct": n_distinct,
             "low": short(numeric.min()) if finite else "not finite",
             "high": short(numeric.max()) if finite else "not finite",
-            "chart": chart_of(numeric) if rows.shape[1] == 1 else None,
-            "map": _map(numeric) if rows.shape[1] == 2 and finite else None,
+            "chart": chart_of(numeric) if rows.shape[1] == 1 and n_distinct > 1 else None,
+            "map": _map(numeric) if rows.shape[1] == 2 and n_distinct > 1 and finite else None,
         }
         parts.append(part)
     return parts

@@ -159,6 +159,9 @@ def test_coverage(grids: Path) -> None:
     assert part["shape"] == "2" and part["n_distinct"] == len(np.unique(agents, axis=0))
     assert part["low"] == f"{agents.min()}" and part["high"] == f"{agents.max()}"
     assert len(part["map"]["cells"]) == part["n_distinct"] and part["map"]["size"] == np.ptp(agents, axis=0).max() + 1
+    # What never varies needs no map.
+    (same,) = (part for part in factor_parts(dataset, index[:1]) if part["name"] == "agent")
+    assert (same["n_distinct"], same["map"]) == (1, None)
     assert part["map"]["visited"] == part["n_distinct"] / part["map"]["size"] ** 2
 
 
