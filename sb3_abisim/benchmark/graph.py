@@ -55,11 +55,18 @@ def build(plan: Plan) -> list[Job]:
         for env_id in plan.env_ids:
             for method in plan.methods:
                 encoder_seed = plan.encoder_seeds[i % len(plan.encoder_seeds)]
-                named = MethodSpec.parse(method.replace("{seed}", str(encoder_seed)))
+                named = _spec(plan, method.replace("{seed}", str(encoder_seed)))
                 run = dataclasses.replace(run_job(plan, env_id, named, seed, encoder_seed), method=method)
                 add(final_job(plan, run) if plan.final_episodes else run)
     _check_owners(plan, list(jobs.values()))
     return list(jobs.values())
+
+
+def _spec(plan: Plan, method: str) -> MethodSpec:
+    spec = MethodSpec.parse(method)
+    if spec.image_key is not None:
+        raise ValueError(f"{method}: the image is the same for all methods; give --image-key {spec.image_key}")
+    return dataclasses.replace(spec, image_key=plan.image_key)
 
 
 def _check_owners(plan: Plan, jobs: list[Job]) -> None:
@@ -93,6 +100,7 @@ def data_job(plan: Plan, env_id: str, hyperparams: Mapping[str, Any]) -> Job:
     settings: dict[str, Any] = {"env_id": env_id, "n_transitions": n, "seed": 0, "env_kwargs": env_kwargs}
     # Left out where there is nothing, as in benchmarks of before.
     settings |= ({"env_wrapper": wrappers} if wrappers else {}) | ({"frame_stack": n_stack} if n_stack > 1 else {})
+    settings |= {} if plan.image_key is None else {"image_key": plan.image_key}
     output = f"data/{_folder(env_id)}-{job_key('data', settings)[:8]}"
     command = ["sb3_abisim", "collect", "--env", env_id, "-n", str(n), "-o", output]
     command += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in env_kwargs.items())] if env_kwargs else []
@@ -101,7 +109,7 @@ def data_job(plan: Plan, env_id: str, hyperparams: Mapping[str, Any]) -> Job:
         command += ["--env-wrapper", *(map(str, wrappers) if wrappers else ["none"])]
     if n_stack > 1 or by_default.get("frame_stack"):
         command += ["--frame-stack", str(n_stack)]
-    command += _packages(plan)
+    command += _image_key(plan) + _packages(plan)
     return Job("data", f"collect {env_id}", settings, (), tuple(command), output, "meta.json", n)
 
 
@@ -161,11 +169,12 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     settings = {"env_id": env_id, "algo": algo, "seed": seed, "method": method.name, "frozen": method.frozen}
     # Only what is given, as in benchmarks of before.
     settings |= method.options
+    settings |= {} if method.image_key is None else {"image_key": method.image_key}
     conf_file, label = method.name, method.name
     if method.encoder is not None:
         encoder = pinned_name(method.encoder)
         file = load_encoder(encoder)
-        check_preprocessing(file, {**used, **replaced}, method.embeds_in_env)
+        check_preprocessing(file, {**used, **replaced}, "vec_env_wrapper" in replaced)
         settings["encoder_hash"] = file.hash
         label += f"-{file.hash[:6]}"
         path = Path(encoder)
@@ -185,7 +194,7 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     command += ["--eval-episodes", str(plan.eval_episodes), "--n-eval-envs", str(plan.n_eval_envs)]
     command += ["--num-threads", str(plan.threads), "--device", plan.device, "--verbose", "0"]
     command += ["-params", *words] if words else []
-    command += _packages(plan)
+    command += _image_key(plan) + _packages(plan)
     output = f"{family}/{algo}/{_folder(env_id)}_{int(key[:10], 16)}"
     title = f"{algo} {method.name}{method.suffix} {env_id} seed {seed}"
     return Job("run", title, settings, inputs, tuple(command), output, f"{_folder(env_id)}.zip", n)
@@ -254,6 +263,10 @@ def final_job(plan: Plan, run: Job) -> Job:
     cost = plan.final_episodes * max(1, len(splits))
     title = run.title.replace(" ", " final ", 1)
     return Job("final", title, settings, (run,), tuple(command), run.output, "final_evaluations.npz", cost)
+
+
+def _image_key(plan: Plan) -> list[str]:
+    return [] if plan.image_key is None else ["--image-key", plan.image_key]
 
 
 def _packages(plan: Plan) -> list[str]:

@@ -1,6 +1,7 @@
 """The jobs of a plan: what names them, and what a changed setting changes."""
 
 import dataclasses
+import itertools
 import re
 from pathlib import Path
 
@@ -312,3 +313,34 @@ def test_options_of_a_method_are_another_arm() -> None:
     assert conf_file == f"abisim={more.inputs[0].output},frozen,task_features_dim=8,augment=random_shift"
     assert "/abisim-frozen-task_features_dim-8-augment-random_shift-" in more.output
     assert drq.command[drq.command.index("--conf-file") + 1] == "drq"
+
+
+def test_the_image_of_a_dict_is_one_for_data_and_all_methods() -> None:
+    plan = Plan(
+        methods=("ssi,frozen", "vanilla", "drq"), env_ids=("Robot-v0",), seeds=(0,), final_episodes=0,
+        image_key="wrist", params=("normalize:False",),
+    )  # fmt: skip
+    jobs = build(plan)
+    assert [job.kind for job in jobs] == ["data", "encoder", "run", "run", "run"]
+    for job in jobs:
+        # Encoders know it from their data.
+        given = [after for word, after in itertools.pairwise(job.command) if word == "--image-key"]
+        assert given == ([] if job.kind == "encoder" else ["wrist"])
+    assert list(run_labels(jobs).values()) == ["ssi,frozen", "vanilla", "drq"]
+    other = names(build(dataclasses.replace(plan, image_key="camera")))
+    assert not names(jobs) & other, "another image makes other jobs"
+    with pytest.raises(ValueError, match=r"the image is the same for all methods; give --image-key camera"):
+        build(dataclasses.replace(plan, methods=("vanilla,image_key=camera",)))
+
+
+def test_a_frozen_encoder_of_a_dict_is_shown_stacks_by_the_zoo(tmp_path: Path) -> None:
+    """Nothing embeds in the environment there, so that ``frame_stack`` stacks observations."""
+    file = write_encoder(
+        tmp_path / "e.safetensors", "Toy-v0", "ssi", {"frame_stack": 2, "image_key": "wrist", "env_wrapper": []}
+    )
+    plan = Plan(
+        methods=(f"ssi={tmp_path / 'e.safetensors'},frozen",), env_ids=("Robot-v0",), seeds=(0,), final_episodes=0,
+        params=("normalize:False", "frame_stack:2"),
+    )  # fmt: skip
+    (job,) = build(plan)
+    assert job.settings["encoder_hash"] == file
