@@ -75,6 +75,17 @@ class RobotEnv(gym.Env[Any, Any]):
         return np.zeros((20, 24, 3), np.uint8)
 
 
+class Camera(gym.ObservationWrapper[NDArray[np.uint8], Any, Any]):
+    """The robot's camera alone."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.observation_space = env.observation_space["camera"]  # type: ignore[index]
+
+    def observation(self, observation: Any) -> NDArray[np.uint8]:
+        return observation["camera"]  # type: ignore[no-any-return]
+
+
 class Invert(gym.ObservationWrapper[NDArray[np.uint8], np.int64, NDArray[np.uint8]]):
     """The negative."""
 

@@ -344,3 +344,26 @@ def test_a_frozen_encoder_of_a_dict_is_shown_stacks_by_the_zoo(tmp_path: Path) -
     )  # fmt: skip
     (job,) = build(plan)
     assert job.settings["encoder_hash"] == file
+
+
+@pytest.mark.parametrize(
+    ("methods", "env_kwargs", "wrapper", "n_images"),
+    [
+        (("ssi", "vanilla"), "", "", 2),
+        (("drq",), "env_kwargs:{wrist: False}", "", 1),
+        # What the runs see is one image.
+        (("drq",), "", "env_wrapper:toy_env.Camera", None),
+        # The encoder file says which.
+        (("ssi",), "", "", None),
+    ],
+)
+def test_a_dict_without_a_key_is_refused_before_anything_runs(
+    methods: tuple[str, ...], env_kwargs: str, wrapper: str, n_images: int | None
+) -> None:
+    params = tuple(word for word in ("normalize:False", env_kwargs, wrapper) if word)
+    plan = Plan(methods=methods, env_ids=("Robot-v0",), seeds=(0,), params=params)
+    if n_images is None:
+        build(plan)
+        return
+    with pytest.raises(ValueError, match=rf"a Dict with {n_images} images \(camera.*choose one with --image-key"):
+        build(plan)

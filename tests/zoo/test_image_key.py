@@ -51,11 +51,13 @@ def env_words(**kwargs: Any) -> list[str]:
         ("dqn", "vanilla", "vanilla", True, 1),
         ("ppo", "drq", "drq", False, 1),
         ("sac", "vanilla", "vanilla", False, 2),
+        ("dqn", "vanilla,auxiliary=ssi:batch_size=8", "vanilla,auxiliary=ssi:batch_size=8", False, 1),
     ],
 )
 def test_from_the_command_to_an_agent(
-    algo: str, conf_file: str, label: str, one: bool, stack: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    algo: str, conf_file: str, label: str, one: bool, stack: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     key = "camera" if one else KEY
     env = env_words(wrist=not one, continuous=algo == "sac")
     words, file = ["-params", *SMALL[algo], "normalize:False"], ""
@@ -79,6 +81,8 @@ def test_from_the_command_to_an_agent(
         assert extractor.frozen is ("frozen" in label) and (extractor.augment is not None) is (label == "drq")
     extractors = model.policy.get_submodule(name.partition(".extractors.")[0]).extractors
     assert set(extractors) == {"arm", "camera", *([] if one else ["wrist"])}
+    if "auxiliary" in label:
+        assert f"the encoder of q_net.{key}, weight 1" in capsys.readouterr().out
     evaluate_final(folder, 2)
     record(folder, tmp_path / "a.gif", n_episodes=1)
     assert not [line for line in run_lines(folder) if line[2]]
