@@ -80,6 +80,8 @@ def _add_budget(parser: argparse.ArgumentParser) -> None:
                         help="RL hyperparameters, the same for all methods")  # fmt: skip
     parser.add_argument("--pretrain-params", nargs="+", default=[], metavar="[OBJECTIVE.]NAME:VALUE",
                         help="settings of pretraining, such as abisim.objective_kwargs.c:0.9")  # fmt: skip
+    parser.add_argument("--image-key", metavar="KEY",
+                        help="which image of a Dict of observations to pretrain on")  # fmt: skip
     parser.add_argument("--device", default="auto")
     parser.add_argument("--threads", type=int, default=1, help="of each job (default: 1)")
     parser.add_argument("--jobs", type=int, help="jobs at a time (default: as the processors allow)")
@@ -96,7 +98,7 @@ def _plan(args: argparse.Namespace, specs: list[str], env_ids: list[str], final_
         n_timesteps=args.n_timesteps, eval_freq=args.eval_freq, eval_episodes=args.eval_episodes,
         n_eval_envs=args.n_eval_envs, final_episodes=final_episodes, params=tuple(args.params),
         pretrain_params=tuple(args.pretrain_params), device=args.device, threads=args.threads,
-        packages=tuple(args.packages),
+        packages=tuple(args.packages), image_key=args.image_key,
     )  # fmt: skip
 
 
@@ -271,7 +273,7 @@ def _comparing_command(args: argparse.Namespace, words: Sequence[str]) -> str:
     """A benchmark of the best trial and of learning from scratch, in the sweep's folder and with its budget."""
     command = [PROGRAM, "benchmark", "-o", args.output, "--env", args.env]
     command += ["--methods", args.method, "vanilla", "--seeds", *map(str, args.seeds)]
-    names = "encoder_seeds algo n_transitions n_timesteps eval_freq eval_episodes n_eval_envs params packages"
+    names = "encoder_seeds algo n_transitions n_timesteps eval_freq eval_episodes n_eval_envs params packages image_key"
     for name in names.split():
         value = getattr(args, name)
         if value:

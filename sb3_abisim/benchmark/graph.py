@@ -7,11 +7,13 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from rl_zoo3.utils import ALGOS
+import gymnasium as gym
+from rl_zoo3.utils import ALGOS, get_wrapper_class
 
 from sb3_abisim.benchmark.jobs.job import Job, job_key
 from sb3_abisim.benchmark.plan import Plan
 from sb3_abisim.common.cli import parse_pairs
+from sb3_abisim.envs import ENV_IDS
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.networks.encoder_name import pinned_name
 from sb3_abisim.pretraining.config import FOLLOWING, load_config
@@ -20,6 +22,7 @@ from sb3_abisim.zoo.collect import preprocessing_entry
 from sb3_abisim.zoo.entries import hyperparameters_entry
 from sb3_abisim.zoo.methods import MethodSpec
 from sb3_abisim.zoo.preprocessing import check_preprocessing, items, normalizes_observations, other_vec_wrappers
+from sb3_abisim.zoo.spaces import check_image_key
 
 # What rl-zoo3 reads besides the algorithm's arguments, and what another flag sets.
 ZOO_PARAMS = {
@@ -50,16 +53,46 @@ def build(plan: Plan) -> list[Job]:
             add(source)
         jobs.setdefault(job.name, job)
 
+    for env_id in plan.env_ids:
+        _check_observations(plan, env_id)
     # Seeds outermost: a benchmark that is stopped early has whole comparisons with fewer seeds.
     for i, seed in enumerate(plan.seeds):
         for env_id in plan.env_ids:
             for method in plan.methods:
                 encoder_seed = plan.encoder_seeds[i % len(plan.encoder_seeds)]
-                named = MethodSpec.parse(method.replace("{seed}", str(encoder_seed)))
+                named = _spec(plan, method.replace("{seed}", str(encoder_seed)))
                 run = dataclasses.replace(run_job(plan, env_id, named, seed, encoder_seed), method=method)
                 add(final_job(plan, run) if plan.final_episodes else run)
     _check_owners(plan, list(jobs.values()))
     return list(jobs.values())
+
+
+def _spec(plan: Plan, method: str) -> MethodSpec:
+    spec = MethodSpec.parse(method)
+    if spec.image_key is not None:
+        raise ValueError(f"{method}: the image is the same for all methods; give --image-key {spec.image_key}")
+    return dataclasses.replace(spec, image_key=plan.image_key)
+
+
+def _check_observations(plan: Plan, env_id: str) -> None:
+    """Refuse now what runs of a method without a file would refuse after all of pretraining: a Dict, and no image."""
+    named = (MethodSpec.parse(method).name for method in plan.methods)
+    if plan.image_key is not None or env_id in ENV_IDS or all(get_method(name).has_encoder_file for name in named):
+        return
+    used = _hyperparams(plan, env_id)[-1]
+    try:
+        wrapper = get_wrapper_class(used)
+        env = gym.make(env_id, **(used.get("env_kwargs") or {}))
+    except Exception:
+        # The first job says so, too, with its log.
+        return
+    try:
+        space = (env if wrapper is None else wrapper(env)).observation_space
+    except Exception:
+        return
+    finally:
+        env.close()
+    check_image_key(space, None)
 
 
 def _check_owners(plan: Plan, jobs: list[Job]) -> None:
@@ -93,6 +126,7 @@ def data_job(plan: Plan, env_id: str, hyperparams: Mapping[str, Any]) -> Job:
     settings: dict[str, Any] = {"env_id": env_id, "n_transitions": n, "seed": 0, "env_kwargs": env_kwargs}
     # Left out where there is nothing, as in benchmarks of before.
     settings |= ({"env_wrapper": wrappers} if wrappers else {}) | ({"frame_stack": n_stack} if n_stack > 1 else {})
+    settings |= {} if plan.image_key is None else {"image_key": plan.image_key}
     output = f"data/{_folder(env_id)}-{job_key('data', settings)[:8]}"
     command = ["sb3_abisim", "collect", "--env", env_id, "-n", str(n), "-o", output]
     command += ["--env-kwargs", *(f"{name}:{value!r}" for name, value in env_kwargs.items())] if env_kwargs else []
@@ -101,7 +135,7 @@ def data_job(plan: Plan, env_id: str, hyperparams: Mapping[str, Any]) -> Job:
         command += ["--env-wrapper", *(map(str, wrappers) if wrappers else ["none"])]
     if n_stack > 1 or by_default.get("frame_stack"):
         command += ["--frame-stack", str(n_stack)]
-    command += _packages(plan)
+    command += _image_key(plan) + _packages(plan)
     return Job("data", f"collect {env_id}", settings, (), tuple(command), output, "meta.json", n)
 
 
@@ -135,6 +169,18 @@ def encoder_job(plan: Plan, env_id: str, objective: str, seed: int, hyperparams:
     return Job("encoder", title, settings, inputs, tuple(command), output, cost=config.n_updates)
 
 
+def _hyperparams(plan: Plan, env_id: str) -> tuple[str, list[str], dict[str, Any], dict[str, Any]]:
+    """Of the runs: the algorithm, the words that are given for it, its entry, and both together."""
+    algo = plan.algo or get_traits(env_id).algo
+    words = _params_of(plan.params, algo, tuple(ALGOS))
+    entry = hyperparameters_entry(algo, env_id)
+    _check_params(algo, [word.partition(":")[0] for word in words])
+    used = {**entry, **parse_pairs(words, "--params")}
+    if not isinstance(used.get("env_kwargs") or {}, Mapping):
+        raise ValueError(f"env_kwargs must be a mapping such as {{max_episode_steps: 20}}, got {used['env_kwargs']!r}")
+    return algo, words, entry, used
+
+
 def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed: int) -> Job:
     """A zoo run; its folder lies where ``rl_zoo3.plots`` looks for it.
 
@@ -142,14 +188,8 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     :param seed: of RL
     :param encoder_seed: of pretraining; of no effect where nothing is pretrained
     """
-    algo = plan.algo or get_traits(env_id).algo
-    words = _params_of(plan.params, algo, tuple(ALGOS))
-    entry = hyperparameters_entry(algo, env_id)
+    algo, words, entry, used = _hyperparams(plan, env_id)
     given = {name: value for name, _, value in (word.partition(":") for word in words)}
-    _check_params(algo, given)
-    used = {**entry, **parse_pairs(words, "--params")}
-    if not isinstance(used.get("env_kwargs") or {}, Mapping):
-        raise ValueError(f"env_kwargs must be a mapping such as {{max_episode_steps: 20}}, got {used['env_kwargs']!r}")
     inputs: tuple[Job, ...] = ()
     if method.encoder is None and get_method(method.name).has_encoder_file:
         inputs = (encoder_job(plan, env_id, method.name, encoder_seed, used),)
@@ -161,11 +201,12 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     settings = {"env_id": env_id, "algo": algo, "seed": seed, "method": method.name, "frozen": method.frozen}
     # Only what is given, as in benchmarks of before.
     settings |= method.options
+    settings |= {} if method.image_key is None else {"image_key": method.image_key}
     conf_file, label = method.name, method.name
     if method.encoder is not None:
         encoder = pinned_name(method.encoder)
         file = load_encoder(encoder)
-        check_preprocessing(file, {**used, **replaced}, method.embeds_in_env)
+        check_preprocessing(file, {**used, **replaced}, "vec_env_wrapper" in replaced)
         settings["encoder_hash"] = file.hash
         label += f"-{file.hash[:6]}"
         path = Path(encoder)
@@ -185,7 +226,7 @@ def run_job(plan: Plan, env_id: str, method: MethodSpec, seed: int, encoder_seed
     command += ["--eval-episodes", str(plan.eval_episodes), "--n-eval-envs", str(plan.n_eval_envs)]
     command += ["--num-threads", str(plan.threads), "--device", plan.device, "--verbose", "0"]
     command += ["-params", *words] if words else []
-    command += _packages(plan)
+    command += _image_key(plan) + _packages(plan)
     output = f"{family}/{algo}/{_folder(env_id)}_{int(key[:10], 16)}"
     title = f"{algo} {method.name}{method.suffix} {env_id} seed {seed}"
     return Job("run", title, settings, inputs, tuple(command), output, f"{_folder(env_id)}.zip", n)
@@ -254,6 +295,10 @@ def final_job(plan: Plan, run: Job) -> Job:
     cost = plan.final_episodes * max(1, len(splits))
     title = run.title.replace(" ", " final ", 1)
     return Job("final", title, settings, (run,), tuple(command), run.output, "final_evaluations.npz", cost)
+
+
+def _image_key(plan: Plan) -> list[str]:
+    return [] if plan.image_key is None else ["--image-key", plan.image_key]
 
 
 def _packages(plan: Plan) -> list[str]:

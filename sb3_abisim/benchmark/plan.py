@@ -28,6 +28,8 @@ class Plan:
     :param device: of pretraining and RL
     :param threads: of each job
     :param packages: modules that register environments and methods, imported by each job
+    :param image_key: which image of a ``Dict`` of observations is pretrained on; the runs see all of them. None for
+        observations that are one image
     :raises ValueError: for what does not fit together
     """
 
@@ -47,6 +49,7 @@ class Plan:
     device: str = "auto"
     threads: int = 1
     packages: tuple[str, ...] = ()
+    image_key: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("methods", "env_ids", "seeds", "encoder_seeds"):

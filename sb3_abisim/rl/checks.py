@@ -11,7 +11,7 @@ from torch import nn
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.networks.encoder_name import EncoderNotFoundError
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
-from sb3_abisim.rl.extractors import BaseEncoderExtractor, EncoderExtractor, PretrainedExtractor
+from sb3_abisim.rl.extractors import BaseEncoderExtractor, EncoderExtractor, PretrainedExtractor, VanillaExtractor
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
 
@@ -54,10 +54,18 @@ def encoders_of(extractor: type, kwargs: Mapping[str, Any]) -> list[tuple[str, s
     :param extractor: its class
     :param kwargs: ``features_extractor_kwargs``
     """
-    if issubclass(extractor, CombinedEncoderExtractor):
-        networks = kwargs.get("networks") or {}
-        return [(name, networks.get(key, {}).get("network")) for key, name in kwargs["encoders"].items()]
-    return [] if kwargs.get("encoder") is None else [(kwargs["encoder"], kwargs.get("network"))]
+    return [(file, network) for _, file, network in _parts(extractor, kwargs) if file is not None]
+
+
+def _parts(extractor: Any, kwargs: Mapping[str, Any]) -> list[tuple[type[BaseEncoderExtractor], str | None, Any]]:
+    """The extractors of one image that one of ours is made of: class, file (None without one) and network."""
+    if not issubclass(extractor, CombinedEncoderExtractor):
+        return [(extractor, kwargs.get("encoder"), kwargs.get("network"))]
+    networks = kwargs.get("networks") or {}
+    return [
+        (VanillaExtractor if file is None else EncoderExtractor, file, networks.get(key, {}).get("network"))
+        for key, file in kwargs["encoders"].items()
+    ]
 
 
 def check_eval_envs(training_env: VecEnv, callback: Any) -> None:
@@ -128,12 +136,21 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any], unfr
     if asked_class is not None:
         if not is_extractor(asked_class):
             return
-        each_class = EncoderExtractor if issubclass(asked_class, CombinedEncoderExtractor) else asked_class
-        hashes = [_hash_of(encoder, network) for encoder, network in encoders_of(asked_class, kwargs)] or [None]
-        absent = None in hashes and issubclass(each_class, PretrainedExtractor)
+        parts = [
+            (each_class, None if file is None else _hash_of(file, network))
+            for each_class, file, network in _parts(asked_class, kwargs)
+        ]
+        absent = any(hash is None and issubclass(each_class, PretrainedExtractor) for each_class, hash in parts)
         frozen = bool(kwargs.get("freeze", False)) and not unfreezes
-        extras = each_class.asked_extras(kwargs)
-        here = {_name(each_class, frozen, None if absent else hash, extras) for hash in hashes}
+        here = {
+            _name(
+                each_class,
+                frozen and issubclass(each_class, PretrainedExtractor),
+                None if absent else hash,
+                each_class.asked_extras(kwargs),
+            )
+            for each_class, hash in parts
+        }
     extractors = [extractor for _, extractor in find_extractors(model.policy)]
     there = {
         _name(type(each), each.frozen and not unfreezes, None if absent else each.hash, each.extras)

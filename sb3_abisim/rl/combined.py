@@ -1,4 +1,4 @@
-"""A features extractor for dictionary observations: an encoder per image, vectors passed on."""
+"""A features extractor for dictionary observations: an encoder per image, all else passed on."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,12 +7,12 @@ import gymnasium as gym
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_abisim.networks.base import NATURE_SIZE
+from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.rl.augment import Augment
-from sb3_abisim.rl.extractors import EncoderExtractor
+from sb3_abisim.rl.extractors import BaseEncoderExtractor, EncoderExtractor, VanillaExtractor
 
 
 class CombinedEncoderExtractor(BaseFeaturesExtractor):
@@ -20,13 +20,14 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
     ``CombinedExtractor`` does, and all of it in one vector.
 
     :param observation_space: a dictionary of one level
-    :param encoders: image key to encoder file, each as for :class:`~sb3_abisim.rl.extractors.EncoderExtractor`
+    :param encoders: image key to encoder file, each as for :class:`~sb3_abisim.rl.extractors.EncoderExtractor`; None
+        for a network without pretraining, as :class:`~sb3_abisim.rl.extractors.VanillaExtractor` has it
     :param freeze: True keeps the encoders' weights as they are; False lets the RL algorithm train them
     :param networks: image key to ``network`` and ``network_kwargs`` of its encoder; what is not there is read from the
         file. :func:`~sb3_abisim.rl.policy_kwargs.policy_kwargs` fills it in: saved models then load without the files
-    :param nature_cnn: whether images without an encoder get SB3's untrained ``NatureCNN``
-    :param cnn_output_dim: size of its output, as in SB3
-    :param task_features_dim: of each image with an encoder, as for an extractor of one image; their outputs stand
+    :param untrained: whether images that are not in ``encoders`` are passed on, too, through the default network of
+        their size, which RL trains from scratch. They are no encoders to callbacks
+    :param task_features_dim: of each image in ``encoders``, as for an extractor of one image; their outputs stand
         behind the embedding of the image
     :param augment: of all images, as for an extractor of one image
     :param augment_kwargs: its keyword arguments
@@ -36,11 +37,10 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
     def __init__(
         self,
         observation_space: gym.Space[Any],
-        encoders: Mapping[str, str],
+        encoders: Mapping[str, str | None],
         freeze: bool = False,
         networks: Mapping[str, Mapping[str, Any]] | None = None,
-        nature_cnn: bool = False,
-        cnn_output_dim: int = 256,
+        untrained: bool = False,
         task_features_dim: int = 0,
         augment: str | None = None,
         augment_kwargs: dict[str, Any] | None = None,
@@ -55,36 +55,26 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
                 f"{', '.join(images) or 'none'}"
             )
         without = [key for key in images if key not in encoders]
-        if without and not nature_cnn:
+        if without and not untrained:
             raise ValueError(
                 f"the images {', '.join(without)} have no encoder; name a file for each in encoders, or give "
-                "nature_cnn=True for Stable-Baselines3's untrained NatureCNN"
+                "untrained=True for networks that are trained from scratch"
             )
+        extras: dict[str, Any] = {"augment": augment, "augment_kwargs": augment_kwargs}
         extractors: dict[str, nn.Module] = {}
         features_dim = 0
         for key, space in observation_space.spaces.items():
-            extractor: BaseFeaturesExtractor | None = None
             if key in encoders:
-                extractor = EncoderExtractor(
-                    space,
-                    encoders[key],
-                    freeze,
-                    **(networks or {}).get(key, {}),
-                    task_features_dim=task_features_dim,
-                    augment=augment,
-                    augment_kwargs=augment_kwargs,
-                )
+                arguments = {**(networks or {}).get(key, {}), "task_features_dim": task_features_dim, **extras}
+                extractor = _encoder(space, encoders[key], freeze, arguments)
+                extractors[key], size = extractor, extractor.features_dim
             elif key in without:
-                if min((space.shape or ())[1:]) < NATURE_SIZE:
-                    raise ValueError(
-                        f"NatureCNN takes images of at least {NATURE_SIZE} pixels, channels first, but {key} has "
-                        f"{space.shape}; pretrain an encoder for it, which may be small"
-                    )
-                extractor = NatureCNN(space, features_dim=cnn_output_dim)
-            extractors[key] = nn.Flatten() if extractor is None else extractor
-            if augment is not None and key in without:
-                extractors[key] = nn.Sequential(Augment(space, augment, augment_kwargs), extractors[key])
-            features_dim += get_flattened_obs_dim(space) if extractor is None else extractor.features_dim
+                network = _untrained(key, space)
+                augmented = [] if augment is None else [Augment(space, augment, augment_kwargs)]
+                extractors[key], size = nn.Sequential(*augmented, network), network.features_dim
+            else:
+                extractors[key], size = nn.Flatten(), get_flattened_obs_dim(space)
+            features_dim += size
         super().__init__(observation_space, features_dim)
         self.extractors = nn.ModuleDict(extractors)
 
@@ -95,3 +85,20 @@ class CombinedEncoderExtractor(BaseFeaturesExtractor):
         :return: float (batch, features_dim)
         """
         return th.cat([extractor(observations[key]) for key, extractor in self.extractors.items()], dim=1)
+
+
+def _encoder(
+    space: gym.Space[Any], encoder: str | None, freeze: bool, arguments: dict[str, Any]
+) -> BaseEncoderExtractor:
+    if encoder is None:
+        return VanillaExtractor(space, **arguments)
+    return EncoderExtractor(space, encoder, freeze, **arguments)
+
+
+def _untrained(key: str, space: gym.Space[Any]) -> Encoder:
+    try:
+        return make_encoder(space)
+    except ValueError as error:
+        raise ValueError(
+            f"the image {key}: {error}; or keep the others only, by env_wrapper gymnasium.wrappers.FilterObservation"
+        ) from error

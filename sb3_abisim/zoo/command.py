@@ -34,7 +34,9 @@ _TRUST = "--trust"
 _MISTAKES = (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error)
 _PACKAGES = ("--packages", "--gym-packages")
 _CONF_FILE = ("-conf", "--conf-file")
-_AUXILIARY = "--auxiliary"
+_AUXILIARY, _IMAGE_KEY = "--auxiliary", "--image-key"
+# What becomes an option of the method, by name, and an example.
+_OPTIONS = {_AUXILIARY: ("auxiliary", "ssi"), _IMAGE_KEY: ("image_key", "camera")}
 _PAIRS = ("-params", "--hyperparams", "--env-kwargs", "--eval-env-kwargs")
 
 
@@ -60,6 +62,9 @@ def main(argv: Sequence[str]) -> None:
         if command == "train":
             print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
             print(f"{_AUXILIARY} {GRAMMAR} trains the encoder by an objective, too: --auxiliary abisim:weight=0.5.")
+            print(
+                f"{_IMAGE_KEY} KEY: the image that the method is for, of a Dict of observations (default: the file's)."
+            )
         print("--packages MODULE ... imports modules that register environments, methods, networks or readers.")
         if command in (*GUARDED, _UNPICKLES, "train"):
             print(f"{_TRUST} opens the pickles of a run folder, which execute whatever they hold: for your own alone.")
@@ -75,7 +80,7 @@ def main(argv: Sequence[str]) -> None:
         words, packages = for_rl_zoo3([flag for flag in flags if flag != _TRUST])
         import_packages(packages)
         if command == "train":
-            words = _with_auxiliary(words)
+            words = _with_options(words)
         modules = [name for name in packages if not is_import_path(name)]
         if modules and command in _WITH_PACKAGES:
             words += ["--gym-packages", *modules]
@@ -146,33 +151,35 @@ def for_rl_zoo3(flags: Sequence[str]) -> tuple[list[str], list[str]]:
     return words, packages
 
 
-def _with_auxiliary(words: Sequence[str]) -> list[str]:
-    """``--auxiliary X`` as ``--conf-file ...,auxiliary=X``, which the run's folder then records.
+def _with_options(words: Sequence[str]) -> list[str]:
+    """``--auxiliary X`` as ``--conf-file ...,auxiliary=X``, which the run's folder then records; so ``--image-key``.
 
     :param words: flags in rl-zoo3's form
     :raises ValueError: for one without its word, or two of them
     """
     rest: list[str] = []
-    found: dict[str, list[str]] = {_AUXILIARY: [], "--conf-file": []}
+    found: dict[str, list[str]] = {flag: [] for flag in (*_OPTIONS, "--conf-file")}
     words = list(words)
     while words:
         word = words.pop(0)
         option, equals, value = word.partition("=")
-        if option != _AUXILIARY and option not in _CONF_FILE:
+        if option not in (*_OPTIONS, *_CONF_FILE):
             rest.append(word)
             continue
         if not equals and not words:
-            raise ValueError(f"{option} takes a word, such as {_AUXILIARY} ssi")
-        found[_AUXILIARY if option == _AUXILIARY else "--conf-file"].append(value if equals else words.pop(0))
-    if len(found[_AUXILIARY]) > 1:
-        raise ValueError(f"{_AUXILIARY} is given twice, {' and '.join(found[_AUXILIARY])}; give one")
+            raise ValueError(f"{option} takes a word, such as {option} {_OPTIONS.get(option, ('', 'abisim'))[1]}")
+        found[option if option in _OPTIONS else "--conf-file"].append(value if equals else words.pop(0))
     configs = found["--conf-file"][-1:]
-    for auxiliary in found[_AUXILIARY]:
-        config = configs[0] if configs else ""
-        if "auxiliary" in split_options(config)[1]:
-            raise ValueError(f"--conf-file {config} names an auxiliary objective already; leave {_AUXILIARY} out")
-        parse_auxiliary(auxiliary)
-        configs = [f"{config},auxiliary={auxiliary}"]
+    for flag, (name, _) in _OPTIONS.items():
+        if len(found[flag]) > 1:
+            raise ValueError(f"{flag} is given twice, {' and '.join(found[flag])}; give one")
+        for value in found[flag]:
+            config = configs[0] if configs else ""
+            if name in split_options(config)[1]:
+                raise ValueError(f"--conf-file {config} says {name} already; leave {flag} out")
+            if flag == _AUXILIARY:
+                parse_auxiliary(value)
+            configs = [f"{config},{name}={value}"]
     return rest + [word for config in configs for word in ("--conf-file", config)]
 
 

@@ -9,7 +9,8 @@ For the environments of this package:
 For every environment:
 
 * ``--conf-file METHOD[=ENCODER][,frozen][,option=value]`` keeps the hyperparameters and replaces the features
-  extractor; frozen and without options, it puts ``VecEncodeObservations`` in its place;
+  extractor; frozen and without options, it puts ``VecEncodeObservations`` in its place. Of a ``Dict`` of observations,
+  it is for one image, which the encoder file names, else ``,image_key=KEY``;
 * ``,auxiliary=OBJECTIVE`` behind any of these, a file or nothing adds an ``AuxiliaryObjective`` to the callbacks;
 * ``policy_kwargs`` of a YAML file may be a mapping that names classes by their dotted paths;
 * copies of one batched environment in one process are stepped as one batch (``BatchedVecEnv``);
@@ -39,7 +40,7 @@ from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 from sb3_abisim.networks.encoder_file import RUN_COPY, load_encoder
 from sb3_abisim.networks.encoder_name import EncoderNotFoundError, resolve_encoder
-from sb3_abisim.registry import get_traits
+from sb3_abisim.registry import get_method, get_traits
 from sb3_abisim.rl.checks import check_trained_with, encoders_of, find_extractors, is_extractor
 from sb3_abisim.rl.extractor_classes import method_of
 from sb3_abisim.zoo.auxiliary import auxiliary_of, with_auxiliary
@@ -58,7 +59,7 @@ from sb3_abisim.zoo.models import continued_model, read_model_run
 from sb3_abisim.zoo.preprocessing import PREPROCESSING_KEYS, check_preprocessing, normalizes_observations
 from sb3_abisim.zoo.run_files import MEANS_NAME, hash_run
 from sb3_abisim.zoo.saved_spaces import read_vec_normalize
-from sb3_abisim.zoo.spaces import check_replayed, check_spaces
+from sb3_abisim.zoo.spaces import check_image_key, check_replayed, check_spaces
 
 rl_utils: Any = importlib.import_module("rl_zoo3.utils")
 exp_manager: Any = importlib.import_module("rl_zoo3.exp_manager")
@@ -179,7 +180,7 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         :param n_envs: number of copies
         :param eval_env: whether they are for evaluation
         :param no_log: whether to write no monitor files
-        :raises ValueError: see :func:`~sb3_abisim.zoo.spaces.check_spaces`
+        :raises ValueError: see :mod:`sb3_abisim.zoo.spaces`
         """
         outer, stack = self.env_wrapper, self.frame_stack
         algorithm = exp_manager.ALGOS[self.algo]
@@ -188,6 +189,8 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             env = env if outer is None else outer(env)
             try:
                 check_spaces(env, stack)
+                if self._spec is not None:
+                    check_image_key(env.observation_space, self._image_key)
                 if self.normalize and encoding_kwargs(self._used) is None and issubclass(algorithm, OffPolicyAlgorithm):
                     check_replayed(env, self.algo)
             except ValueError:
@@ -200,6 +203,12 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
             return super().create_envs(n_envs, eval_env, no_log)
         finally:
             self.env_wrapper = outer
+
+    @property
+    def _image_key(self) -> str | None:
+        """Which image of a Dict has the method's encoder; None for observations that are one image."""
+        kwargs = self._policy_kwargs.get("features_extractor_kwargs") or {}
+        return ", ".join(kwargs.get("encoders") or {}) or None
 
     def create_log_folder(self) -> None:
         """As rl-zoo3 does, unless the encoder is missing."""
@@ -233,7 +242,10 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         if not is_extractor(extractor):
             return MethodRecord(None, False, None, None, preprocessing)
         kwargs = self._policy_kwargs.get("features_extractor_kwargs") or {}
-        method = method_of(extractor)
+        if self._image_key is not None:
+            preprocessing["image_key"] = self._image_key
+        # The extractor of a Dict belongs to no method.
+        method = method_of(extractor) or (None if self._spec is None else self._spec.name)
         names, hashes = [], []
         for encoder, network in encoders_of(extractor, kwargs):
             names.append(str(encoder))
@@ -248,6 +260,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
                     raise
         frozen = bool(kwargs.get("freeze", False)) and not unfreezes(self._used)
         options = {name: kwargs[name] for name in ("task_features_dim", "augment") if kwargs.get(name)}
+        if self._spec is not None and options.get("augment") == get_method(self._spec.name).augment:
+            # The extractor of a Dict has to be told that of the method.
+            options.pop("augment", None)
         return MethodRecord(
             method, frozen, ", ".join(names) or None, ", ".join(hashes) or None, preprocessing, **options
         )

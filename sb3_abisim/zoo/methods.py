@@ -18,13 +18,15 @@ from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_
 
 # What may stand after a method as ",name=value", in this order, and the type of the value.
 _OPTIONS: dict[str, Callable[[str], Any]] = {"task_features_dim": int, "augment": str, "auxiliary": str}
+# The same, but it says what is observed and is no part of the method.
+_IMAGE_KEY = "image_key"
 # Of these, what stands in the entry's callbacks and so behind a file, too; all others are arguments of the extractor.
 _CALLBACK_OPTIONS = ("auxiliary",)
 
 
 def grammar() -> str:
     """How a method spec is written, for messages."""
-    options = "".join(f"[,{name}=VALUE]" for name in _OPTIONS)
+    options = "".join(f"[,{name}=VALUE]" for name in (*_OPTIONS, _IMAGE_KEY))
     return f"METHOD[=ENCODER][,frozen]{options} with METHOD one of {', '.join(methods())}"
 
 
@@ -39,6 +41,8 @@ class MethodSpec:
     :param task_features_dim: size of the trainable network beside the encoder, 0 for none
     :param augment: name of an augmentation; None for that of the method
     :param auxiliary: objective that trains the encoder, too (:mod:`sb3_abisim.zoo.auxiliary`); None for none
+    :param image_key: the image of a ``Dict`` of observations that the method is for; all else there is passed on. None
+        for what the encoder file has recorded, else for observations that are one image
     :raises ValueError: for an unknown method, or an encoder or ``frozen`` for an untrained one
     """
 
@@ -48,6 +52,7 @@ class MethodSpec:
     task_features_dim: int = 0
     augment: str | None = None
     auxiliary: str | None = None
+    image_key: str | None = None
 
     def __post_init__(self) -> None:
         if self.name not in methods():
@@ -60,6 +65,8 @@ class MethodSpec:
             get_augmentation(self.augment)
         if self.auxiliary is not None:
             self._check_auxiliary(self.auxiliary)
+        if self.image_key == "":
+            raise ValueError(f"no key after '{_IMAGE_KEY}='; give {grammar()}")
         if not get_method(self.name).has_encoder_file and (self.encoder is not None or self.frozen):
             raise ValueError(
                 f"{self.name!r} trains its network from scratch: it takes neither an encoder nor ',frozen'"
@@ -149,11 +156,12 @@ class MethodSpec:
             encoder = _encoder_name(kwargs)
             replaced["policy_kwargs"] = self.policy_kwargs(kwargs)
         file = self._file(encoder)
-        if self.embeds_in_env and _image_key(file) is None:
+        key = self._key(file)
+        if self.embeds_in_env and key is None:
             wrapper = {ENCODING_WRAPPER: {"encoder": self._encoder(encoder), "objective": self.name}}
             replaced["vec_env_wrapper"] = [*items(entry.get("vec_env_wrapper")), wrapper]
         if self.embeds_in_env or "policy" not in given:
-            replaced["policy"] = self._policy(str(entry.get("policy")), _image_key(file))
+            replaced["policy"] = self._policy(str(entry.get("policy")), key)
         for name in sorted({"policy_kwargs", *replaced} & set(given)):
             raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
         settings = {**entry, **given}
@@ -178,13 +186,10 @@ class MethodSpec:
         method = get_method(self.name)
         shipped = _encoder_name(kwargs)
         file = self._file(shipped)
-        key = _image_key(file)
-        if file is not None and key is not None:
-            # Of a Dict: an encoder for its image, and everything else passed on.
-            check_objective(file, self.name)
+        key = self._key(file)
+        if key is not None:
             replaced["features_extractor_class"] = f"sb3_abisim.{CombinedEncoderExtractor.__name__}"
-            arguments = {"encoders": {key: self._encoder(shipped)}, "networks": {key: stored_network(file)}}
-            replaced["features_extractor_kwargs"] = {**arguments, "freeze": self.frozen, **self.extractor_options}
+            replaced["features_extractor_kwargs"] = self._combined(key, file, shipped)
         elif not self.embeds_in_env:
             replaced["features_extractor_class"] = f"sb3_abisim.{method.extractor}"
             arguments = self.extractor_options
@@ -195,6 +200,31 @@ class MethodSpec:
             if arguments:
                 replaced["features_extractor_kwargs"] = arguments
         return replaced
+
+    def _combined(self, key: str, file: EncoderFile | None, shipped: str | None) -> dict[str, Any]:
+        """Of a Dict: an encoder for one of its images, and everything else passed on."""
+        method = get_method(self.name)
+        arguments: dict[str, Any] = {"encoders": {key: None}, "untrained": True}
+        if method.has_encoder_file:
+            arguments |= {"encoders": {key: self._encoder(shipped)}, "freeze": self.frozen}
+        if file is not None:
+            check_objective(file, self.name)
+            arguments["networks"] = {key: stored_network(file)}
+        if method.augment is not None:
+            arguments["augment"] = method.augment
+        return {**arguments, **self.extractor_options}
+
+    def _key(self, file: EncoderFile | None) -> str | None:
+        """Which image of a Dict the method is for; None for observations that are one image."""
+        recorded = None if file is None else file.metadata["preprocessing"].get("image_key")
+        if file is None or recorded is None:
+            return self.image_key
+        if self.image_key not in (None, recorded):
+            raise ValueError(
+                f"{file.path} was pretrained on the image {recorded!r}, not {self.image_key!r}; leave --image-key out, "
+                f"or collect with --image-key {self.image_key} and pretrain again"
+            )
+        return str(recorded)
 
     def _encoder(self, shipped: str | None) -> str:
         if self.encoder is not None:
@@ -227,6 +257,11 @@ class MethodSpec:
         replaced = policy.replace(wrong, right)
         # A dotted path is a custom policy.
         if right not in replaced and "." not in replaced:
+            if "MultiInput" in policy:
+                raise ValueError(
+                    f"--conf-file {self.name} needs a policy for one image observation, and {policy} is none; choose "
+                    "one of the images of the Dict with --image-key"
+                )
             raise ValueError(
                 f"--conf-file {self.name} needs a policy for one image observation, and {policy} is none; choose "
                 "another algorithm with --algo, or write a YAML file for this environment"
@@ -242,12 +277,13 @@ def split_options(text: str) -> tuple[str, dict[str, Any]]:
     """
     rest, given = text, dict[str, Any]()
     # From the end: a path may hold commas and equals signs, and so may a value.
-    while match := re.fullmatch(rf"(.*),(?:(frozen)|({'|'.join(_OPTIONS)})=(.*))", rest):
+    options: dict[str, Callable[[str], Any]] = {**_OPTIONS, _IMAGE_KEY: str}
+    while match := re.fullmatch(rf"(.*),(?:(frozen)|({'|'.join(options)})=(.*))", rest):
         rest, frozen, option, value = match.groups()
         if (frozen or option) in given:
             raise ValueError(f"{text!r} says {frozen or option} twice; give {grammar()}")
         try:
-            given[frozen or option] = True if frozen else _OPTIONS[option](value)
+            given[frozen or option] = True if frozen else options[option](value)
         except ValueError as error:
             raise ValueError(f"{option} takes no {value!r} in {text!r}; give {grammar()}") from error
     return rest, given
@@ -274,9 +310,3 @@ def suffix_of(given: Any) -> str:
 def _encoder_name(policy_kwargs: Mapping[str, Any]) -> str | None:
     encoder = (policy_kwargs.get("features_extractor_kwargs") or {}).get("encoder")
     return None if encoder is None else str(encoder)
-
-
-def _image_key(file: EncoderFile | None) -> str | None:
-    """Which key of a Dict an encoder was pretrained on; None for observations that are one image."""
-    key = None if file is None else file.metadata["preprocessing"].get("image_key")
-    return None if key is None else str(key)

@@ -238,4 +238,8 @@ def _without_encoder(policy_kwargs: Any, record: MethodRecord | None) -> Any:
     if isinstance(kwargs.get("features_extractor_kwargs"), dict):
         inner = kwargs["features_extractor_kwargs"]
         kwargs["features_extractor_kwargs"] = {name: value for name, value in inner.items() if name != "encoder"}
+        if isinstance(inner.get("encoders"), dict):
+            # Of a Dict: which images have one.
+            there = {key: file is not None for key, file in inner["encoders"].items()}
+            kwargs["features_extractor_kwargs"]["encoders"] = there
     return kwargs

@@ -45,6 +45,29 @@ def check_spaces(env: gym.Env[Any, Any], frame_stack: int | None) -> None:
             )
 
 
+def check_image_key(space: gym.Space[Any], key: str | None) -> None:
+    """Refuse a method that is for another image than the observations have.
+
+    :param space: of the observations
+    :param key: of the image in a ``Dict`` that the method is for; None for observations that are one image
+    :raises ValueError: naming the images that there are
+    """
+    if not isinstance(space, spaces.Dict):
+        if key is not None:
+            raise ValueError(
+                f"the image {key!r} is one of a Dict of observations, and these are {space}; leave --image-key out, "
+                "and give an encoder that was pretrained on such"
+            )
+        return
+    images = [name for name, part in space.spaces.items() if is_image_space(part)]
+    if key not in images:
+        wrong = "" if key is None else f"no {key!r}, but "
+        raise ValueError(
+            f"the observations are a Dict with {wrong}{len(images)} images ({', '.join(images) or 'none'}) in {space}; "
+            "choose one with --image-key, in collect as here"
+        )
+
+
 def check_replayed(env: gym.Env[Any, Any], algo: str) -> None:
     """Refuse images with channels last for a replay buffer behind ``VecNormalize``.
 

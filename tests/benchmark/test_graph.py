@@ -1,6 +1,7 @@
 """The jobs of a plan: what names them, and what a changed setting changes."""
 
 import dataclasses
+import itertools
 import re
 from pathlib import Path
 
@@ -312,3 +313,57 @@ def test_options_of_a_method_are_another_arm() -> None:
     assert conf_file == f"abisim={more.inputs[0].output},frozen,task_features_dim=8,augment=random_shift"
     assert "/abisim-frozen-task_features_dim-8-augment-random_shift-" in more.output
     assert drq.command[drq.command.index("--conf-file") + 1] == "drq"
+
+
+def test_the_image_of_a_dict_is_one_for_data_and_all_methods() -> None:
+    plan = Plan(
+        methods=("ssi,frozen", "vanilla", "drq"), env_ids=("Robot-v0",), seeds=(0,), final_episodes=0,
+        image_key="wrist", params=("normalize:False",),
+    )  # fmt: skip
+    jobs = build(plan)
+    assert [job.kind for job in jobs] == ["data", "encoder", "run", "run", "run"]
+    for job in jobs:
+        # Encoders know it from their data.
+        given = [after for word, after in itertools.pairwise(job.command) if word == "--image-key"]
+        assert given == ([] if job.kind == "encoder" else ["wrist"])
+    assert list(run_labels(jobs).values()) == ["ssi,frozen", "vanilla", "drq"]
+    other = names(build(dataclasses.replace(plan, image_key="camera")))
+    assert not names(jobs) & other, "another image makes other jobs"
+    with pytest.raises(ValueError, match=r"the image is the same for all methods; give --image-key camera"):
+        build(dataclasses.replace(plan, methods=("vanilla,image_key=camera",)))
+
+
+def test_a_frozen_encoder_of_a_dict_is_shown_stacks_by_the_zoo(tmp_path: Path) -> None:
+    """Nothing embeds in the environment there, so that ``frame_stack`` stacks observations."""
+    file = write_encoder(
+        tmp_path / "e.safetensors", "Toy-v0", "ssi", {"frame_stack": 2, "image_key": "wrist", "env_wrapper": []}
+    )
+    plan = Plan(
+        methods=(f"ssi={tmp_path / 'e.safetensors'},frozen",), env_ids=("Robot-v0",), seeds=(0,), final_episodes=0,
+        params=("normalize:False", "frame_stack:2"),
+    )  # fmt: skip
+    (job,) = build(plan)
+    assert job.settings["encoder_hash"] == file
+
+
+@pytest.mark.parametrize(
+    ("methods", "env_kwargs", "wrapper", "n_images"),
+    [
+        (("ssi", "vanilla"), "", "", 2),
+        (("drq",), "env_kwargs:{wrist: False}", "", 1),
+        # What the runs see is one image.
+        (("drq",), "", "env_wrapper:toy_env.Camera", None),
+        # The encoder file says which.
+        (("ssi",), "", "", None),
+    ],
+)
+def test_a_dict_without_a_key_is_refused_before_anything_runs(
+    methods: tuple[str, ...], env_kwargs: str, wrapper: str, n_images: int | None
+) -> None:
+    params = tuple(word for word in ("normalize:False", env_kwargs, wrapper) if word)
+    plan = Plan(methods=methods, env_ids=("Robot-v0",), seeds=(0,), params=params)
+    if n_images is None:
+        build(plan)
+        return
+    with pytest.raises(ValueError, match=rf"a Dict with {n_images} images \(camera.*choose one with --image-key"):
+        build(plan)

@@ -168,7 +168,7 @@ def test_a_file_alone_has_no_augmentation_imported() -> None:
 def test_all_images_of_a_dictionary(path: Path) -> None:
     wide = spaces.Box(0, 255, (3, 40, 44), np.uint8)
     space = spaces.Dict({"camera": SPACE, "speed": spaces.Box(-1, 1, (2,)), "wide": wide})
-    kwargs: dict[str, Any] = {"encoders": {"camera": str(path)}, "nature_cnn": True, "cnn_output_dim": 7}
+    kwargs: dict[str, Any] = {"encoders": {"camera": str(path)}, "untrained": True}
     extractor = CombinedEncoderExtractor(space, **kwargs, augment="random_crop")
     plain = CombinedEncoderExtractor(space, **kwargs)
     inputs = {"camera": INPUTS, "speed": th.ones(6, 2), "wide": th.rand(6, 3, 40, 44)}

@@ -9,7 +9,6 @@ import pytest
 import torch as th
 from extractor_inputs import ALGORITHMS, SPACE, RandomImages, write
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import NatureCNN
 
 import sb3_abisim
 from sb3_abisim import CombinedEncoderExtractor, load_encoder, policy_kwargs
@@ -47,13 +46,13 @@ def make(name: str, kwargs: dict[str, Any]) -> Any:
 
 def build(path: Path, freeze: bool = False, **more: Any) -> dict[str, Any]:
     kwargs = policy_kwargs({"camera": path}, freeze)
-    kwargs["features_extractor_kwargs"].update(nature_cnn=True, cnn_output_dim=7, **more)
+    kwargs["features_extractor_kwargs"].update(untrained=True, **more)
     return kwargs
 
 
 def test_features_are_those_of_each_part_in_the_order_of_the_space(tmp_path: Path) -> None:
     path = write(tmp_path / "e.safetensors", "BatchNorm")
-    extractor = CombinedEncoderExtractor(DICT, {"camera": str(path)}, nature_cnn=True, cnn_output_dim=7).eval()
+    extractor = CombinedEncoderExtractor(DICT, {"camera": str(path)}, untrained=True).eval()
     # Gymnasium sorts keys.
     assert list(extractor.extractors) == ["camera", "gear", "speed", "wide"]
     n = 4
@@ -62,11 +61,12 @@ def test_features_are_those_of_each_part_in_the_order_of_the_space(tmp_path: Pat
         "wide": th.rand(n, *WIDE.shape),
     }  # fmt: skip
     features = extractor(parts)
-    assert features.shape == (n, extractor.features_dim) and extractor.features_dim == 6 + 5 + 6 + 7
+    assert features.shape == (n, extractor.features_dim) and extractor.features_dim == 6 + 5 + 6 + 512
     assert th.equal(features[:, :6], load_encoder(path).encoder(parts["camera"]))
     assert th.equal(features[:, 6:11], parts["gear"]) and th.equal(features[:, 11:17], parts["speed"].flatten(1))
-    assert isinstance(extractor.extractors["wide"], NatureCNN)
-    assert th.equal(features[:, 17:], extractor.extractors["wide"](parts["wide"]))
+    (wide,) = extractor.extractors["wide"]  # type: ignore[misc]
+    assert wide.spec()["name"] == "nature"
+    assert th.equal(features[:, 17:], wide(parts["wide"]))
 
 
 @pytest.mark.parametrize("freeze", [False, True])
@@ -104,14 +104,14 @@ def test_guards_hold_inside(tmp_path: Path, name: str, freeze: bool) -> None:
 @pytest.mark.parametrize(
     ("space", "kwargs", "message"),
     [
-        (DICT, {"encoders": {"camera": "{}"}}, "images wide have no encoder; .*nature_cnn=True"),
+        (DICT, {"encoders": {"camera": "{}"}}, "images wide have no encoder; .*untrained=True"),
         (DICT, {"encoders": {}}, "images camera, wide have no encoder"),
         (DICT, {"encoders": {"speed": "{}"}}, "given for speed, but the images .* are camera, wide"),
         (DICT, {"encoders": {"cam": "{}"}}, "given for cam, but"),
         (
-            DICT,
-            {"encoders": {}, "nature_cnn": True},
-            r"NatureCNN takes images of at least 36 .* camera has \(3, 15, 15\)",
+            spaces.Dict({"camera": SPACE, "low": spaces.Box(0, 255, (3, 2, 40), np.uint8)}),
+            {"encoders": {"camera": "{}"}, "untrained": True},
+            r"the image low: small takes images of at least 3 x 3 pixels, got 2 x 40.*or keep the others only",
         ),
         (spaces.Dict({"wide": WIDE}), {"encoders": {"wide": "{}"}}, "pretrained on Nav2D-v0 with observation_space"),
         (SPACE, {"encoders": {}}, "must be a dictionary.*use EncoderExtractor"),
@@ -126,7 +126,7 @@ def test_refuses(tmp_path: Path, space: gym.Space[Any], kwargs: dict[str, Any], 
 
 
 def test_a_missing_file_is_fatal_when_training_starts(tmp_path: Path) -> None:
-    kwargs = {"encoders": {"camera": str(tmp_path / "mistyped")}, "nature_cnn": True}
+    kwargs = {"encoders": {"camera": str(tmp_path / "mistyped")}, "untrained": True}
     model = make("DQN", {"features_extractor_class": CombinedEncoderExtractor, "features_extractor_kwargs": kwargs})
     with pytest.raises(FileNotFoundError, match=r"searched .*mistyped"):
         require_weights(model)

@@ -149,7 +149,7 @@ def test_train_continue_and_enjoy(
     (["--auxiliary", "sssi"], "unknown method 'sssi'"),
     (["--auxiliary"], "--auxiliary takes a word, such as --auxiliary ssi"),
     (["--auxiliary=ssi", "--auxiliary=curl"], "--auxiliary is given twice, ssi and curl; give one"),
-    (["--conf-file", "vanilla,auxiliary=ssi", "--auxiliary", "curl"], "names an auxiliary objective already"),
+    (["--conf-file", "vanilla,auxiliary=ssi", "--auxiliary", "curl"], "says auxiliary already; leave --auxiliary out"),
     (["-conf", "abisim,frozen", "--auxiliary", "ssi"], "leave one of the two out, or give weight=0"),
     (["--conf-file", "vanilla", "--auxiliary", "ssi:objective_kwargs.wight=1"], "objective_kwargs do not fit ssi"),
 ])  # fmt: skip
