@@ -4,6 +4,7 @@ Readers come from Stable-Baselines3, Gymnasium, torchvision, PEFT and Hugging Fa
 Names inside files that were written before a name changed are mapped in ``sb3_abisim/common/vocabulary.py`` alone.
 """
 
+import json
 import re
 import subprocess
 from pathlib import Path
@@ -28,7 +29,7 @@ EXEMPT = {
 }
 # Committed results keep what they were written with, and licenses are quoted.
 LEFT_OUT = ("benchmarks/results/comparison/", "sb3_abisim/media/LICENSES-media.md")
-SUFFIXES = {".py", ".md", ".yml", ".cfg", ".toml", ".html", ".css", ""}
+SUFFIXES = {".py", ".md", ".yml", ".cfg", ".toml", ".html", ".css", ".ipynb", ""}
 
 # Pattern: what to write instead. Without regard to case.
 WORDS = {
@@ -86,7 +87,15 @@ def files() -> list[str]:
     ]
 
 
-TEXTS = {name: (ROOT / name).read_text(encoding="utf-8", errors="replace").splitlines() for name in files()}
+def lines_of(name: str) -> list[str]:
+    text = (ROOT / name).read_text(encoding="utf-8", errors="replace")
+    if name.endswith(".ipynb"):
+        # What was written, not the figures that came out.
+        text = "\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"])
+    return text.splitlines()
+
+
+TEXTS = {name: lines_of(name) for name in files()}
 
 
 @pytest.mark.parametrize("pattern", WORDS)

@@ -1,5 +1,6 @@
 """The figures, plotted from the numbers that the other modules of this folder compute. Needs the extra ``plots``."""
 
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ COLORS = {"agent": (214, 40, 40), "obstacles": (60, 64, 72), "floor": (240, 240,
 
 
 def pyplot() -> Any:
-    """Matplotlib's pyplot, without a window.
+    """Matplotlib's pyplot, without a window where the user has not imported it before, as a notebook has.
 
     :raises ImportError: if matplotlib is not installed
     """
     with needs_extra("plots", "a figure"):
         import matplotlib
-    matplotlib.use("Agg")
+    if "matplotlib.pyplot" not in sys.modules:
+        matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     return plt

@@ -207,3 +207,16 @@ def test_an_environment_of_another_package(tmp_path, monkeypatch, capsys):
         with pytest.raises(SystemExit):
             analyze.main([name, *words])
         assert "no encoder ships for mine/Plain-v0; name the files to look at" in capsys.readouterr().err
+
+
+def test_figures_leave_the_backend_of_a_notebook(tmp_path):
+    import matplotlib
+    import matplotlib.pyplot as plt
+
+    before = matplotlib.get_backend()
+    plt.switch_backend("svg")
+    try:
+        analyze.main(["curves", "--env", "Nav2D-v0", "--images", str(tmp_path)])
+        assert matplotlib.get_backend() == "svg"
+    finally:
+        plt.switch_backend(before)
