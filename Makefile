@@ -74,7 +74,7 @@ figures: setup  ## make every figure of docs/figures.md again from the committed
 # The folders of committed runs whose curves are in docs/results.md: of evaluations, and of training episodes.
 COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
 TRAINING_COMPARISONS := distractor_frozen_longer distractor_frozen_early distractor_frozen_7m distractor_finetuned_more \
-	nav2d_ppo_frozen distractor_frozen_layer minigrid_fourrooms
+	nav2d_ppo_frozen distractor_frozen_layer minigrid_fourrooms nav2d_random_goal
 # Compared with the runs of nav2d_dqn_target.
 NAV2D_VANILLA := vanilla, 10,000=benchmarks/results/comparison/nav2d_dqn/runs/Nav2D-v0/vanilla-cd2b7a74
 
