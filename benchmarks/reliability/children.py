@@ -5,6 +5,7 @@ Python. This process must therefore have one thread. Linux.
 """
 
 import contextlib
+import fcntl
 import json
 import os
 import resource
@@ -14,7 +15,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ from typing import Any
 # What a case may take before it is stopped, far above what counts as a breach: of the clock, and of a processor.
 SECONDS, CPU_SECONDS = 600.0, 90
 ADDRESS_BYTES = 6 << 30
+# More than any case prints; the system lets every user have so large a pipe.
+OUTPUT_BYTES = 1 << 20
 MAX_SECONDS, MAX_MEGABYTES = 30.0, 1000.0
 # Exceptions that end in one sentence: of a command, it is what it prints.
 SENTENCES = (ValueError, OSError, FloatingPointError, ImportError)
@@ -94,15 +97,35 @@ def run(
     :param max_file_bytes: of each file that it writes; more fails as on a full disk
     :param watched: whether its memory is limited and its acts are noted
     """
-    with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as result:
+    with _output() as (written, read), tempfile.TemporaryFile() as result:
         child = os.fork()
         if not child:
-            _child(case, folder, output.fileno(), result.fileno(), max_file_bytes, watched)
+            _child(case, folder, written, result.fileno(), max_file_bytes, watched)
         status, usage = _wait(child, time.monotonic() + seconds)
-        outcome = _read(status, output, result)
+        outcome = _read(status, read(), result)
         outcome.seconds = usage.ru_utime + usage.ru_stime
         outcome.megabytes = usage.ru_maxrss / 1024
         return outcome
+
+
+@contextlib.contextmanager
+def _output() -> Iterator[tuple[int, Callable[[], str]]]:
+    """A pipe, to which no limit of files applies: where to write, and what has been written so far."""
+    source, sink = os.pipe()
+    fcntl.fcntl(sink, fcntl.F_SETPIPE_SZ, OUTPUT_BYTES)
+    os.set_blocking(source, False)
+
+    def read() -> str:
+        try:
+            return os.read(source, OUTPUT_BYTES).decode(errors="replace")
+        except BlockingIOError:
+            return ""
+
+    try:
+        yield sink, read
+    finally:
+        os.close(source)
+        os.close(sink)
 
 
 def _wait(child: int, deadline: float) -> tuple[int, Any]:
@@ -222,9 +245,7 @@ def _note(acts: list[str], folder: Path, event: str, args: Sequence[Any]) -> Non
             acts.append(f"write {path}")
 
 
-def _read(status: int, output: Any, result: Any) -> Outcome:
-    output.seek(0)
-    text = output.read().decode(errors="replace")
+def _read(status: int, text: str, result: Any) -> Outcome:
     last = text.rstrip().rpartition("\n")[2]
     result.seek(0)
     content = result.read()

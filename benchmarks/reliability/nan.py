@@ -84,7 +84,8 @@ def _break_at(model: Any, place: str, value: float, at: int, draw: random.Random
 
         def broken(*args: Any, **kwargs: Any) -> Any:
             actions, *rest = predict(*args, **kwargs)
-            if model.num_timesteps >= at:
+            # Counted after the step that this action is for.
+            if model.num_timesteps >= at - 1:
                 actions = actions.clone() if isinstance(actions, th.Tensor) else actions.copy()
                 actions.reshape(-1)[0] = value
             return (actions, *rest)
