@@ -16,8 +16,7 @@ from sb3_abisim.common.method_settings import settings_entry
 from sb3_abisim.registry import get_method, get_objective
 from sb3_abisim.rl.auxiliary_data import ReplaySteps, RolloutHistory, RolloutSteps, Steps, read_rollout
 from sb3_abisim.rl.auxiliary_trainer import N_PREPARE, AuxiliarySettings, AuxiliaryTrainer
-from sb3_abisim.rl.checks import find_extractors, require_weights
-from sb3_abisim.rl.combined import CombinedEncoderExtractor
+from sb3_abisim.rl.checks import find_extractors, image_keys, require_weights
 from sb3_abisim.rl.extractors import BaseEncoderExtractor
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
@@ -238,12 +237,7 @@ def trained_extractors(
     if not isinstance(model, OnPolicyAlgorithm | OffPolicyAlgorithm):
         raise ValueError(f"{type(model).__name__} has neither a rollout buffer nor a replay buffer to learn from")
     found: dict[str, tuple[BaseEncoderExtractor, str | None]] = {}
-    keys = {
-        id(part): key
-        for module in model.policy.modules()
-        if isinstance(module, CombinedEncoderExtractor)
-        for key, part in module.extractors.items()
-    }
+    keys = image_keys(model.policy)
     for name, extractor in find_extractors(model.policy):
         head, key = _HEADS.get(name.split(".")[0], name.split(".")[0]), keys.get(id(extractor))
         found[head if key is None else f"{head}.{key}"] = extractor, key

@@ -54,16 +54,33 @@ def encoders_of(extractor: type, kwargs: Mapping[str, Any]) -> list[tuple[str, s
     :param extractor: its class
     :param kwargs: ``features_extractor_kwargs``
     """
-    return [(file, network) for _, file, network in _parts(extractor, kwargs) if file is not None]
+    return [(file, network) for _, _, file, network in _parts(extractor, kwargs) if file is not None]
 
 
-def _parts(extractor: Any, kwargs: Mapping[str, Any]) -> list[tuple[type[BaseEncoderExtractor], str | None, Any]]:
-    """The extractors of one image that one of ours is made of: class, file (None without one) and network."""
+def image_keys(policy: nn.Module) -> dict[int, str]:
+    """Which image of a ``Dict`` of observations an extractor is for.
+
+    :param policy: ``model.policy``
+    :return: the keys, by ``id`` of the extractor; none of those for observations that are one image
+    """
+    return {
+        id(part): key
+        for module in policy.modules()
+        if isinstance(module, CombinedEncoderExtractor)
+        for key, part in module.extractors.items()
+    }
+
+
+_Part = tuple[str | None, type[BaseEncoderExtractor], str | None, str | None]
+
+
+def _parts(extractor: Any, kwargs: Mapping[str, Any]) -> list[_Part]:
+    """The extractors of one image that one of ours is made of: key, class, file (None without one) and network."""
     if not issubclass(extractor, CombinedEncoderExtractor):
-        return [(extractor, kwargs.get("encoder"), kwargs.get("network"))]
+        return [(None, extractor, kwargs.get("encoder"), kwargs.get("network"))]
     networks = kwargs.get("networks") or {}
     return [
-        (VanillaExtractor if file is None else EncoderExtractor, file, networks.get(key, {}).get("network"))
+        (key, VanillaExtractor if file is None else EncoderExtractor, file, networks.get(key, {}).get("network"))
         for key, file in kwargs["encoders"].items()
     ]
 
@@ -137,10 +154,10 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any], unfr
         if not is_extractor(asked_class):
             return
         parts = [
-            (each_class, None if file is None else _hash_of(file, network))
-            for each_class, file, network in _parts(asked_class, kwargs)
+            (key, each_class, None if file is None else _hash_of(file, network))
+            for key, each_class, file, network in _parts(asked_class, kwargs)
         ]
-        absent = any(hash is None and issubclass(each_class, PretrainedExtractor) for each_class, hash in parts)
+        absent = any(hash is None and issubclass(each_class, PretrainedExtractor) for _, each_class, hash in parts)
         frozen = bool(kwargs.get("freeze", False)) and not unfreezes
         here = {
             _name(
@@ -148,13 +165,14 @@ def check_trained_with(model: BaseAlgorithm, policy_kwargs: dict[str, Any], unfr
                 frozen and issubclass(each_class, PretrainedExtractor),
                 None if absent else hash,
                 each_class.asked_extras(kwargs),
+                key,
             )
-            for each_class, hash in parts
+            for key, each_class, hash in parts
         }
-    extractors = [extractor for _, extractor in find_extractors(model.policy)]
+    keys = image_keys(model.policy)
     there = {
-        _name(type(each), each.frozen and not unfreezes, None if absent else each.hash, each.extras)
-        for each in extractors
+        _name(type(each), each.frozen and not unfreezes, None if absent else each.hash, each.extras, keys.get(id(each)))
+        for _, each in find_extractors(model.policy)
     }
     if there != here:
         sides = (" and ".join(sorted(side)) or "none of our extractors" for side in (there, here))
@@ -168,5 +186,6 @@ def _hash_of(encoder: str, network: str | None) -> str | None:
         return None
 
 
-def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None, extras: str) -> str:
-    return extractor.__name__ + f", hash {hash}" * (hash is not None) + ", frozen" * frozen + extras
+def _name(extractor: type[BaseEncoderExtractor], frozen: bool, hash: str | None, extras: str, key: str | None) -> str:
+    of_key = "" if key is None else f" of {key}"
+    return extractor.__name__ + of_key + f", hash {hash}" * (hash is not None) + ", frozen" * frozen + extras

@@ -156,11 +156,13 @@ def test_continuing_compares_the_extractor_of_the_image(tmp_path: Path, monkeypa
     same = MethodSpec("vanilla", image_key=KEY).policy_kwargs({})
     kwargs = {**same, "features_extractor_class": type(model.policy.features_extractor)}
     check_trained_with(model, kwargs)
-    kwargs["features_extractor_kwargs"] = {**same["features_extractor_kwargs"], "augment": "random_shift"}
-    with pytest.raises(
-        ValueError, match="trained with VanillaExtractor, not with VanillaExtractor, augment=random_shift"
+    for other, message in (
+        (MethodSpec("drq", image_key=KEY), "of wrist, not with VanillaExtractor of wrist, augment=random_shift"),
+        (MethodSpec("vanilla", image_key="camera"), "of wrist, not with VanillaExtractor of camera"),
     ):
-        check_trained_with(model, kwargs)
+        kwargs["features_extractor_kwargs"] = other.policy_kwargs({})["features_extractor_kwargs"]
+        with pytest.raises(ValueError, match=f"it was trained with VanillaExtractor {message}"):
+            check_trained_with(model, kwargs)
 
 
 def test_runs_on_encoders_of_several_seeds_are_one_method() -> None:
