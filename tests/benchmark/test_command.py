@@ -90,7 +90,9 @@ def test_the_whole_graph_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     err = capsys.readouterr().err
     assert "4 of 4 jobs done, 0 of them before; 0 failed" in err and "warning" not in err
     report = tmp_path / "b" / "report"
-    assert {path.name for path in report.iterdir()} == {"index.html", "curves.png", "curves.csv", "final.csv"}
+    assert {path.name for path in report.iterdir()} == {
+        "index.html", "curves.png", "curves.csv", "final.csv", "times.csv",
+    }  # fmt: skip
     with open(report / "final.csv", newline="") as file:
         kinds = [(row["method"], row["mode"], row["split"], row["paper"]) for row in csv.DictReader(file)]
     assert kinds == [("ssi", "deterministic", "standard", "-12.613"), ("ssi", "stochastic", "standard", "")]
