@@ -110,8 +110,13 @@ def flat_network(observation_space: gym.Space[Any], width: int = 6) -> nn.Module
     return nn.Sequential(nn.Flatten(), nn.Linear(int(np.prod(observation_space.shape)), width), nn.Tanh())
 
 
+# Small, and so that every objective finds what it needs in few steps.
+SMALL: dict[str, Any] = {"update_interval": 8, "batch_size": 16}
+FEW_GOALS: dict[str, Any] = {"n_goals": 6, "goal_share": 0.1}
+
+
 def register_inputs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Register the objectives and the network "Flat", for one test."""
+    """Register the objectives and the network "Flat", and let few observations prepare an objective, for one test."""
     registry.networks(), registry.methods()
     monkeypatch.setitem(registry._NETWORKS.by_name, "Flat", registry.Network("Flat", flat_network, None))
     for objective in (Recorder, SequenceRecorder):
@@ -120,6 +125,8 @@ def register_inputs(monkeypatch: pytest.MonkeyPatch) -> None:
         )
         monkeypatch.setitem(registry._METHODS.by_name, objective.name, method)
     monkeypatch.setattr(Recorder, "batches", [])
+    monkeypatch.setattr("sb3_abisim.rl.auxiliary.N_PREPARE", 24)
+    monkeypatch.setattr("sb3_abisim.rl.auxiliary_trainer.N_PREPARE", 24)
 
 
 def build(name: str, env: Any = None, other_sharing: bool = False, **kwargs: Any) -> Any:

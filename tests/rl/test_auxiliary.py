@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import stable_baselines3 as sb3
 import torch as th
-from auxiliary_inputs import Recorder, build, make_envs, register_inputs
+from auxiliary_inputs import FEW_GOALS, SMALL, Recorder, build, make_envs, register_inputs
 from extractor_inputs import ALGORITHMS, SHARING, write
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
@@ -22,19 +22,15 @@ from sb3_abisim.rl.checks import find_extractors
 
 VARIANTS = [(name, False) for name in ALGORITHMS] + [(name, True) for name in SHARING]
 OBJECTIVES = [name for name, method in methods().items() if method.is_pretrained]
-# Small, and so that every objective finds what it needs in few steps.
-SMALL: dict[str, Any] = {"update_interval": 8, "batch_size": 16}
 KWARGS: dict[str, dict[str, Any]] = {
     "abisim": {"objective_kwargs": {"action_radius": 2.0}},
-    "goal_progress": {"objective_kwargs": {"n_goals": 6, "goal_share": 0.1}},
+    "goal_progress": {"objective_kwargs": FEW_GOALS},
 }
 
 
 @pytest.fixture(autouse=True)
 def inputs(monkeypatch: pytest.MonkeyPatch) -> None:
     register_inputs(monkeypatch)
-    monkeypatch.setattr("sb3_abisim.rl.auxiliary.N_PREPARE", 24)
-    monkeypatch.setattr("sb3_abisim.rl.auxiliary_trainer.N_PREPARE", 24)
 
 
 class Watch(BaseCallback):

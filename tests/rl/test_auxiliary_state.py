@@ -8,25 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
-from auxiliary_inputs import CONTINUOUS, build, make_envs, register_inputs
+from auxiliary_inputs import CONTINUOUS, FEW_GOALS, SMALL, build, make_envs, register_inputs
 from extractor_inputs import ALGORITHMS
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
 from sb3_abisim.rl.auxiliary import AuxiliaryObjective
 from sb3_abisim.rl.auxiliary_state import KEY, pack, unpack
 
-SMALL: dict[str, Any] = {"update_interval": 8, "batch_size": 16}
 KWARGS: dict[str, dict[str, Any]] = {
     "abisim": {"objective_kwargs": {"action_radius": 2.0, "expectation": "uniform"}},
-    "goal_progress": {"objective_kwargs": {"n_goals": 6, "goal_share": 0.1}},
+    "goal_progress": {"objective_kwargs": FEW_GOALS},
 }
 
 
 @pytest.fixture(autouse=True)
 def inputs(monkeypatch: pytest.MonkeyPatch) -> None:
     register_inputs(monkeypatch)
-    monkeypatch.setattr("sb3_abisim.rl.auxiliary.N_PREPARE", 24)
-    monkeypatch.setattr("sb3_abisim.rl.auxiliary_trainer.N_PREPARE", 24)
 
 
 def callback_of(objective: str, **kwargs: Any) -> AuxiliaryObjective:
