@@ -80,3 +80,13 @@ def test_what_no_manifest_says_is_not_guessed(root: Path) -> None:
     assert times.run_time(next(r for r in find_runs(root) if r.label == "ssi")).before is None
     (root / "benchmark.json").unlink()
     assert times.run_time(read_run(run.folder)) is None, "a plain run of the zoo"
+
+
+def test_no_interval_goes_below_nothing(root: Path) -> None:
+    """Two runs on machines of different speed: Student's t alone would allow less than no time."""
+    for path in (root / "jobs").glob("run-*.json"):
+        content = json.loads(path.read_text())
+        seconds = 60 if content["output"].endswith("_1") else 60_000
+        path.write_text(json.dumps({**content, "seconds": seconds}))
+    rows = [row for row in compare([str(root)]).times if row["method"] == "vanilla"]
+    assert rows and all(row["low"] == 0 and row["high"] > row["minutes"] for row in rows)
