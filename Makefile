@@ -71,23 +71,8 @@ reliability: setup  ## damaged and hostile files, kills, steps and NaN, counted,
 figures: setup  ## make every figure of docs/figures.md again from the committed encoders; about a quarter of an hour
 	$(BIN)/sb3-abisim analyze all --images docs/images --numbers benchmarks/results
 
-# The folders of committed runs whose curves are in docs/results.md: of evaluations, and of training episodes.
-COMPARISONS := distractor_frozen distractor_finetuned_methods pointmaze_finetuned nav2d_dqn nav2d_dqn_long
-TRAINING_COMPARISONS := distractor_frozen_longer distractor_frozen_early distractor_frozen_7m distractor_finetuned_more \
-	nav2d_ppo_frozen distractor_frozen_layer minigrid_fourrooms nav2d_random_goal
-# Compared with the runs of nav2d_dqn_target.
-NAV2D_VANILLA := vanilla, 10,000=benchmarks/results/comparison/nav2d_dqn/runs/Nav2D-v0/vanilla-cd2b7a74
-
-comparisons: setup  ## plot every curve of docs/results.md again from the committed runs; a minute
-	@draw() { \
-		name=$$1; shift; \
-		$(BIN)/sb3-abisim benchmark report benchmarks/results/comparison/$$name "$$@" -o build/comparisons/$$name && \
-		cp build/comparisons/$$name/curves.png docs/images/comparison-$$name.png; \
-	}; \
-	for name in $(COMPARISONS); do draw $$name || exit 1; done; \
-	for name in $(TRAINING_COMPARISONS); do draw $$name --source training || exit 1; done; \
-	draw nav2d_dqn_target "$(NAV2D_VANILLA)" && \
-	draw distractor_vanilla_longer benchmarks/results/comparison/distractor_finetuned_more --source training
+comparisons: setup  ## fill the tables and plot the curves of the results pages again from the committed runs; a minute
+	$(BIN)/python -m benchmarks.results_page --figures
 
 benchmark: setup  ## the paper's comparison with its budgets, days on one machine, into benchmark/; resumes
 	$(BIN)/sb3-abisim benchmark -o benchmark

@@ -1,4 +1,6 @@
-"""Fill the tables of docs/ from the committed runs: ``python -m benchmarks.results_page [PAGE ...]``.
+"""Fill the tables of docs/ from the committed runs, and draw their curves.
+
+Run ``python -m benchmarks.results_page [PAGE ...]``.
 
 A table stands between two comments. The first says in YAML what it shows, and this script writes what is between::
 
@@ -7,7 +9,8 @@ A table stands between two comments. The first says in YAML what it shows, and t
     source: training                        # or evaluations; of curves, steps and ratios
     reference: goal_progress,frozen         # whose steps are divided in ratios; without it, the first row
     rows: {"ssi,frozen": SSI}               # label of a method: what the table calls it; all methods without it
-    columns: [final stochastic/standard, steps 0.5, ratio 0.5]
+    columns: [return stochastic/standard, steps 0.5, ratio 0.5]    # none: no table
+    figure: nav2d_ppo_frozen                # with --figures, the curves of the rows: docs/images/comparison-*.png
     -->
     <!-- end -->
 
@@ -23,12 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from sb3_abisim.benchmark.report import statistics
+from sb3_abisim.benchmark.report import figures, statistics
 from sb3_abisim.benchmark.report.groups import Group, group_runs, labeled_runs
-from sb3_abisim.benchmark.report.tables import time_to
+from sb3_abisim.benchmark.report.tables import compare, time_to
 
 ROOT = Path(__file__).resolve().parent.parent
 RUNS = ROOT / "benchmarks" / "results" / "comparison"
+IMAGES = ROOT / "docs" / "images"
 TABLE = re.compile(r"(<!-- table\n(.*?)-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 
@@ -145,9 +149,11 @@ def table(spec: dict[str, Any]) -> str:
     :return: lines of Markdown
     :raises ValueError: for an unknown key, column or row, with what there is
     """
-    unknown = spec.keys() - {"runs", "source", "reference", "rows", "columns"}
+    unknown = spec.keys() - {"runs", "source", "reference", "rows", "columns", "figure"}
     if unknown:
         raise ValueError(f"a table has no {', '.join(sorted(unknown))}")
+    if not spec.get("columns"):
+        return ""
     columns = [next(iter(c.items())) if isinstance(c, dict) else (c, None) for c in spec["columns"]]
     parts = [(*column.partition(" ")[::2], header) for column, header in columns]
     for name, _, _ in parts:
@@ -184,11 +190,24 @@ def fill(page: str) -> str:
 
     def write(match: re.Match[str]) -> str:
         try:
-            return f"{match[1]}\n{table(yaml.safe_load(match[2]))}\n\n{match[4]}"
+            lines = table(yaml.safe_load(match[2]))
+            return match[1] + (f"\n{lines}\n\n" if lines else "") + match[4]
         except (ValueError, KeyError) as error:
             raise ValueError(f"{error}, in the table\n{match[2]}") from error
 
     return TABLE.sub(write, page)
+
+
+def draw(spec: dict[str, Any]) -> bytes:
+    """The curves of a table's rows, under the names that they have there.
+
+    :param spec: see the module
+    :return: a PNG file
+    """
+    folders = [_folder(word) for word in spec["runs"]]
+    rows = spec.get("rows") or {run.label: run.label for run in labeled_runs(folders)}
+    comparison = compare(folders, spec.get("source", "evaluations"), spec.get("reference", next(iter(rows))), [0.5])
+    return figures.plot_curves(comparison, rows)
 
 
 def pages() -> list[Path]:
@@ -201,8 +220,14 @@ def main() -> None:
     parser.add_argument(
         "pages", type=Path, nargs="*", help="pages of Markdown (default: those of docs/)", default=pages()
     )
-    for path in parser.parse_args().pages:
+    parser.add_argument("--figures", action="store_true", help="draw the curves as well")
+    args = parser.parse_args()
+    for path in args.pages:
         path.write_text(fill(path.read_text()))
+        for match in TABLE.finditer(path.read_text()) if args.figures else ():
+            spec = yaml.safe_load(match[2])
+            if "figure" in spec:
+                (IMAGES / f"comparison-{spec['figure']}.png").write_bytes(draw(spec))
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ import yaml
 from benchmarks import results_page
 
 RESULTS = results_page.ROOT / "docs" / "results.md"
+APPENDIX = results_page.ROOT / "docs" / "results_appendix.md"
+IMAGES = results_page.ROOT / "docs" / "images"
 SPEC = {"runs": ["nav2d_dqn_target"], "reference": "abisim"}
 
 
@@ -18,10 +20,11 @@ def test_tables_are_those_of_the_committed_runs(path: Path) -> None:
     assert results_page.fill(text) == text, f"run python -m benchmarks.results_page {path}"
 
 
-def test_the_page_of_results_types_no_number_that_its_tables_and_commands_lack() -> None:
+@pytest.mark.parametrize("path", [RESULTS, APPENDIX], ids=lambda path: path.name)
+def test_a_page_of_results_types_no_number_that_its_tables_and_commands_lack(path: Path) -> None:
     """Section by section: a number of two digits or more in prose is in a table or a command."""
     free = []
-    for section in re.split(r"^## ", RESULTS.read_text(), flags=re.MULTILINE)[1:]:
+    for section in re.split(r"^## ", path.read_text(), flags=re.MULTILINE)[1:]:
         given = "\n".join(line for line in section.splitlines() if line.startswith(("|", "    ")))
         prose = re.sub(r"<!--.*?-->", "", section, flags=re.DOTALL)
         prose = "\n".join(line for line in prose.splitlines() if not line.startswith(("|", "    ")))
@@ -29,6 +32,39 @@ def test_the_page_of_results_types_no_number_that_its_tables_and_commands_lack()
         numbers = re.findall(r"\d[\d.,]*\d", re.sub(r"\]\(.*?\)|`.*?`", "", prose))
         free += [number for number in numbers if number.replace(",", "").rstrip(".") not in known]
     assert not free
+
+
+def test_figures_are_drawn_from_the_tables_of_their_pages() -> None:
+    shown, drawn = set(), []
+    for path in (RESULTS, APPENDIX):
+        text = path.read_text()
+        shown |= set(re.findall(r"\(images/comparison-(.*?)\.png\)", text))
+        drawn += [spec["figure"] for match in results_page.TABLE.finditer(text)
+                  if "figure" in (spec := yaml.safe_load(match[2]))]  # fmt: skip
+    assert len(drawn) == len(set(drawn))
+    assert shown == set(drawn) == {path.stem.removeprefix("comparison-") for path in IMAGES.glob("comparison-*.png")}
+
+
+def test_curves_are_those_of_the_rows_under_their_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.figure import Figure
+
+    legends = []
+    legend = Figure.legend
+    monkeypatch.setattr(
+        Figure, "legend", lambda self, *args, **kwargs: legends.append(args) or legend(self, *args, **kwargs)
+    )
+    rows = {"vanilla": "from scratch", "acro": "ACRO"}
+    image = results_page.draw({**SPEC, "reference": "vanilla", "rows": rows, "columns": ["area"]})
+    assert image.startswith(b"\x89PNG")
+    ((lines, names),) = legends
+    assert names == ["from scratch", "ACRO"]
+    assert len({line.get_color() for line in lines}) == 2
+    assert len(lines[0].axes.lines) == 2, "methods without a row are drawn, too"
+
+
+def test_without_columns_there_is_no_table() -> None:
+    text = f"<!-- table\n{yaml.safe_dump({**SPEC, 'figure': 'nav2d'})}-->\n<!-- end -->"
+    assert results_page.fill(text) == text
 
 
 def test_a_wrong_number_in_a_table_is_mended() -> None:

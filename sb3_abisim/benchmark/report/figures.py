@@ -3,7 +3,7 @@
 import io
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,9 +84,7 @@ def plot(comparison: Comparison) -> dict[str, bytes]:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    labels = list(dict.fromkeys(label for groups in comparison.groups.values() for label in groups))
-    labels.sort(key=lambda label: label != comparison.reference)
-    colors = assign_colors(labels)
+    colors = _colors(comparison)
     images = {}
     functions = {
         "curves": _curves, "thresholds": _thresholds, "splits": _splits, "aggregates": _aggregates,
@@ -96,12 +94,42 @@ def plot(comparison: Comparison) -> dict[str, bytes]:
         for name, function in functions.items():
             figure = function(comparison, colors)
             if figure is not None:
-                buffer = io.BytesIO()
-                # Without it the file holds matplotlib's version, and equal reports would differ.
-                figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-                plt.close(figure)
-                images[name] = buffer.getvalue()
+                images[name] = _png(figure)
     return images
+
+
+def plot_curves(comparison: Comparison, names: Mapping[str, str]) -> bytes:
+    """The learning curves of some methods, under names for readers.
+
+    :param comparison: what to plot
+    :param names: label of a method to what the legend calls it, in the order of the legend
+    :return: a PNG file
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    colors = _colors(comparison)
+    with plt.rc_context(_STYLE):
+        return _png(_curves(comparison, {label: colors[label] for label in names}, names))
+
+
+def _colors(comparison: Comparison) -> dict[str, str]:
+    """Each label's color, the reference first."""
+    labels = list(dict.fromkeys(label for groups in comparison.groups.values() for label in groups))
+    labels.sort(key=lambda label: label != comparison.reference)
+    return assign_colors(labels)
+
+
+def _png(figure: "Figure") -> bytes:
+    import matplotlib.pyplot as plt
+
+    buffer = io.BytesIO()
+    # Without it the file holds matplotlib's version, and equal reports would differ.
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    plt.close(figure)
+    return buffer.getvalue()
 
 
 def assign_colors(labels: Sequence[str]) -> dict[str, str]:
@@ -119,14 +147,14 @@ def assign_colors(labels: Sequence[str]) -> dict[str, str]:
     return {label: taken.pop(name) if name in taken else next(spare) for label, name in pairs}
 
 
-def _curves(comparison: Comparison, colors: dict[str, str]) -> "Figure":
+def _curves(comparison: Comparison, colors: dict[str, str], names: Mapping[str, str] | None = None) -> "Figure":
     import matplotlib.pyplot as plt
 
     n = len(comparison.groups)
-    figure, axes = plt.subplots(1, n, figsize=(max(6.4, 4.4 * n), 4.2), squeeze=False)
+    figure, axes = plt.subplots(1, n, figsize=(max(6.4, 4.4 * n), 4.0), squeeze=False)
     for axis, (env_id, groups) in zip(axes[0], comparison.groups.items(), strict=True):
         # The reference last, so that it lies on top.
-        for label in reversed(groups):
+        for label in reversed([label for label in groups if label in colors]):
             rows = [row for row in comparison.curves if (row["env_id"], row["method"]) == (env_id, label)]
             steps, mean, low, high = (np.array([row[key] for row in rows]) for key in ("steps", "mean", "low", "high"))
             width = 2.4 if label == comparison.reference else 1.6
@@ -140,9 +168,12 @@ def _curves(comparison: Comparison, colors: dict[str, str]) -> "Figure":
     axes[0, 0].set_ylabel("return")
     handles = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     # About 0.7 inches for an entry's line and 0.1 for each letter; what does not fit into one row takes several.
-    per_row = int(figure.get_figwidth() / (0.7 + 0.1 * max(map(len, colors))))
+    shown = [(names or {}).get(label, label) for label in colors]
+    per_row = int(figure.get_figwidth() / (0.7 + 0.1 * max(map(len, shown))))
     ncols = max(1, min(per_row, len(colors)))
-    figure.legend([handles[name] for name in colors], list(colors), loc="outside lower center", ncols=ncols)
+    # Above the legend, the curves keep their height.
+    figure.set_figheight(3.4 + 0.22 * -(-len(colors) // ncols))
+    figure.legend([handles[label] for label in colors], shown, loc="outside lower center", ncols=ncols)
     return figure
 
 
