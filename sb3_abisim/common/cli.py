@@ -5,9 +5,11 @@ Nothing heavy is imported here, so that ``--help`` answers at once.
 
 import argparse
 import ast
+import functools
 import importlib
 import re
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -99,6 +101,9 @@ def run(
     :param interrupted: said after Ctrl-C
     """
     args = parser.parse_args(argv)
+    # A writer in the background, as TensorBoard's, hands its error to whoever writes next: one line here, too.
+    usual = threading.excepthook
+    threading.excepthook = functools.partial(_say_in_one_line, parser.prog, usual)
     try:
         import_packages(args.packages)
         code = function(args)
@@ -115,8 +120,19 @@ def run(
         parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
     except KeyboardInterrupt:
         parser.exit(130, f"{parser.prog}: {interrupted}\n")
+    finally:
+        threading.excepthook = usual
     if code:
         sys.exit(code)
+
+
+def _say_in_one_line(
+    program: str, usual: Callable[[threading.ExceptHookArgs], object], failed: threading.ExceptHookArgs
+) -> None:
+    if isinstance(failed.exc_value, OSError):
+        print(f"{program}: {one_line(failed.exc_value)}", file=sys.stderr)
+    else:
+        usual(failed)
 
 
 def one_line(error: BaseException) -> str:

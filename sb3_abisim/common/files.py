@@ -44,7 +44,7 @@ def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], ob
     # Random, since processes in containers that share a folder have equal numbers, and threads of one have one.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_TEMPORARY_SUFFIX}")
     try:
-        with open(temporary, "wb") as file:
+        with naming(path), open(temporary, "wb") as file:
             if size and hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)
             write_fn(file)
@@ -55,6 +55,21 @@ def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], ob
         temporary.unlink(missing_ok=True)
         raise
     fsync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Name the place in the system's errors that name none, as those of writing into an open file.
+
+    :param path: what is written
+    :raises OSError: the same with its file name
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
 
 
 def fsync_folder(path: str | os.PathLike[str]) -> None:
@@ -119,7 +134,7 @@ def folder_lock(path: str | os.PathLike[str]) -> Iterator[None]:
         )
     try:
         # Windows lets nobody write in, or remove, a file that is locked.
-        with contextlib.suppress(PermissionError):
+        with naming(lock_path), contextlib.suppress(PermissionError):
             lock_path.write_text(f"process {os.getpid()} on host {socket.gethostname()}")
         yield
     finally:

@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import CSVOutputFormat, Logger, configure
 from stable_baselines3.common.utils import get_device
 from tqdm import tqdm
 
+from sb3_abisim.common.files import naming
 from sb3_abisim.common.transitions import TransitionBatch
 from sb3_abisim.data.dataset import Split, TransitionDataset
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess, set_memory_format
@@ -163,7 +164,8 @@ class PretrainRun:
             frames = th.as_tensor(self._some_frames(N_STANDARDIZE, "train")).to(self.device)
             self.module.prepare(preprocess(frames, self.dataset.observation_space))
         self._saved_at = self.n_updates
-        logger = self._logger(verbose)
+        with naming(self.folder):
+            logger = self._logger(verbose)
         sums: dict[str, float] = {}
         bar = tqdm(
             initial=self.n_updates,
@@ -181,14 +183,16 @@ class PretrainRun:
                 bar.update()
                 if self.n_updates % self.config.log_interval and self.n_updates < self.config.n_updates:
                     continue
-                self._log(logger, sums)
+                with naming(self.folder):
+                    self._log(logger, sums)
                 sums = {}
                 # A checkpoint falls on a row of the log, so that no half-filled sums need saving.
                 if self.n_updates - self._saved_at >= self.config.checkpoint_interval:
                     self.save()
         finally:
             bar.close()
-            logger.close()
+            with naming(self.folder):
+                logger.close()
         self.finish()
 
     def save(self) -> None:

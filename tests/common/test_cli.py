@@ -2,6 +2,7 @@
 
 import argparse
 import errno
+import threading
 
 import pytest
 
@@ -78,6 +79,25 @@ def test_an_error_is_one_line(error: BaseException, code: int, capsys: pytest.Ca
     line = text.strip().splitlines()[-1]
     assert line.startswith("sb3-abisim some command: ") and "two lines" in line
     assert "Traceback" not in text
+
+
+def test_an_error_of_a_thread_is_one_line_and_a_bug_in_one_is_not(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bugs = []
+    monkeypatch.setattr(threading, "excepthook", lambda failed: bugs.append(failed.exc_value))
+    before = threading.excepthook
+
+    def function(args: argparse.Namespace) -> None:
+        for error in (OSError(errno.ENOSPC, "two\nlines", "events"), RuntimeError("a bug")):
+            thread = threading.Thread(target=raising(error), args=(args,))  # type: ignore[arg-type]
+            thread.start()
+            thread.join()
+
+    run(make_parser("some command", "d", "x"), [], function)
+    assert capsys.readouterr().err == "sb3-abisim some command: [Errno 28] two lines: 'events'\n"
+    assert [str(bug) for bug in bugs] == ["a bug"]
+    assert threading.excepthook is before
 
 
 def test_an_interrupt_says_how_to_go_on(capsys: pytest.CaptureFixture[str]) -> None:

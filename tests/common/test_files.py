@@ -73,6 +73,15 @@ def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path, error
     assert os.listdir(tmp_path) == ["file"]
 
 
+def test_a_failed_write_names_the_file(tmp_path: Path) -> None:
+    def fill_the_disk(file: BinaryIO) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(OSError, match=r"No space left on device: '.*name\.npy'") as caught:
+        write_atomic(tmp_path / "name.npy", fill_the_disk)
+    assert caught.value.errno == errno.ENOSPC
+
+
 def test_full_disk_is_found_out_before_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int, offset: int, size: int) -> None:
         assert size == 3

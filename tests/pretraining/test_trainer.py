@@ -1,10 +1,12 @@
 """The training loop: what is trained on, in which order, and when it stops."""
 
+import errno
 import json
 
 import pytest
 import torch as th
 from pretrain_inputs import SETTINGS, collect_grids, make_run, run
+from stable_baselines3.common.logger import Logger
 
 from sb3_abisim import register_network, registry
 from sb3_abisim.data.dataset import TransitionDataset
@@ -166,3 +168,18 @@ def test_a_callback_adds_to_the_log_and_changes_nothing_else(data, tmp_path):
     sizes = json.loads(output.with_suffix(".json").read_text())["curves"]["exact/size"]
     assert len(sizes) == 6 and all(size > 0 for size in sizes)
     assert "exact/size" in (output.with_suffix(".run") / "progress.csv").read_text().splitlines()[0].split(",")
+
+
+@pytest.mark.parametrize("method", ["dump", "close"])
+def test_a_log_that_cannot_be_written_names_its_folder(data, tmp_path, monkeypatch, method):
+    """TensorBoard's writer names no file."""
+
+    whole = getattr(Logger, method)
+
+    def fill_the_disk(self, *args):
+        whole(self, *args)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Logger, method, fill_the_disk)
+    with pytest.raises(OSError, match=r"No space left on device: '.*x\.run'"):
+        run(data, tmp_path / "x.safetensors")
