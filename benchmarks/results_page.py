@@ -15,6 +15,9 @@ A table stands between two comments. The first says in YAML what it shows, and t
     <!-- end -->
 
 A column may be ``{COLUMN: HEADER}``. See :data:`COLUMNS` for what there is.
+
+A table over several comparisons has ``parts``, one for each column. Each is a description as above with one of
+``columns``, and its ``rows`` lead from what the table calls a method to the label of its runs.
 """
 
 import argparse
@@ -146,19 +149,45 @@ def table(spec: dict[str, Any]) -> str:
     """One table.
 
     :param spec: see the module
-    :return: lines of Markdown
+    :return: lines of Markdown; none without columns
     :raises ValueError: for an unknown key, column or row, with what there is
     """
-    unknown = spec.keys() - {"runs", "source", "reference", "rows", "columns", "figure"}
+    parts = spec.get("parts")
+    _check_keys(spec, {"parts"} if parts else {"runs", "source", "reference", "rows", "columns", "figure"})
+    if parts is None:
+        header, rows = _columns(spec)
+    else:
+        header, rows = [], {}
+        for place, part in enumerate(parts):
+            _check_keys(part, {"runs", "source", "reference", "rows", "columns"})
+            names = {label: name for name, label in part["rows"].items()}
+            more, found = _columns({**part, "rows": names})
+            header += more
+            for name, cells in found.items():
+                row = rows.setdefault(name, [])
+                row += ["not run"] * (place - len(row)) + cells
+        rows = {name: cells + ["not run"] * (len(header) - len(cells)) for name, cells in rows.items()}
+    if not header:
+        return ""
+    lines = ["| | " + " | ".join(header) + " |", "|---|" + "---:|" * len(header)]
+    return "\n".join(lines + [f"| {name} | " + " | ".join(cells) + " |" for name, cells in rows.items()])
+
+
+def _check_keys(spec: dict[str, Any], known: set[str]) -> None:
+    unknown = spec.keys() - known
     if unknown:
         raise ValueError(f"a table has no {', '.join(sorted(unknown))}")
-    if not spec.get("columns"):
-        return ""
-    columns = [next(iter(c.items())) if isinstance(c, dict) else (c, None) for c in spec["columns"]]
+
+
+def _columns(spec: dict[str, Any]) -> tuple[list[str], dict[str, list[str]]]:
+    """The header, and the cells of each row."""
+    columns = [next(iter(c.items())) if isinstance(c, dict) else (c, None) for c in spec.get("columns", ())]
     parts = [(*column.partition(" ")[::2], header) for column, header in columns]
     for name, _, _ in parts:
         if name not in COLUMNS:
             raise ValueError(f"a column is one of {', '.join(COLUMNS)}, got {name!r}")
+    if not parts:
+        return [], {}
     runs = labeled_runs([_folder(word) for word in spec["runs"]])
     rows = spec.get("rows") or {run.label: run.label for run in runs}
     first = spec.get("reference", next(iter(rows)))
@@ -166,14 +195,11 @@ def table(spec: dict[str, Any]) -> str:
     missing = {first, *rows} - groups.keys()
     if missing:
         raise ValueError(f"no runs of {', '.join(sorted(missing))}; there are {', '.join(groups)}")
-    lines = [
-        "| | " + " | ".join(header or COLUMNS[name][1](argument) for name, argument, header in parts) + " |",
-        "|---|" + "---:|" * len(parts),
-    ]
-    for label, shown in rows.items():
-        cells = [COLUMNS[name][0](Cell(groups[label], groups[first], argument)) for name, argument, _ in parts]
-        lines.append(f"| {shown} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    cells = {
+        shown: [COLUMNS[name][0](Cell(groups[label], groups[first], argument)) for name, argument, _ in parts]
+        for label, shown in rows.items()
+    }
+    return [header or COLUMNS[name][1](argument) for name, argument, header in parts], cells
 
 
 def _folder(word: str) -> str:

@@ -62,6 +62,21 @@ def test_curves_are_those_of_the_rows_under_their_names(monkeypatch: pytest.Monk
     assert len(lines[0].axes.lines) == 2, "methods without a row are drawn, too"
 
 
+def test_a_table_over_comparisons_says_what_was_not_run() -> None:
+    one = {"runs": ["nav2d_dqn_target"], "columns": ["return stochastic/standard"], "rows": {"A": "abisim", "S": "ssi"}}
+    two = {"runs": ["nav2d_dqn_long"], "columns": [{"area": "mean"}], "rows": {"V": "vanilla", "A": "abisim"}}
+    lines = results_page.table({"parts": [one, two]}).splitlines()
+    alone = [results_page.table({**p, "rows": {b: a for a, b in p["rows"].items()}}).splitlines() for p in (one, two)]
+    assert lines[0] == "| | final return, stochastic | mean |"
+    cells = {row[1]: row for row in ([cell.strip() for cell in line.split("|")] for line in lines[2:])}
+    assert list(cells) == ["A", "S", "V"]
+    assert cells["S"][3] == cells["V"][2] == "not run"
+    assert f"| A | {cells['A'][2]} |" in alone[0] and f"| A | {cells['A'][3]} |" in alone[1]
+    assert f"| V | {cells['V'][3]} |" in alone[1]
+    with pytest.raises(ValueError, match="a table has no figure"):
+        results_page.table({"parts": [{**one, "figure": "x"}]})
+
+
 def test_without_columns_there_is_no_table() -> None:
     text = f"<!-- table\n{yaml.safe_dump({**SPEC, 'figure': 'nav2d'})}-->\n<!-- end -->"
     assert results_page.fill(text) == text
