@@ -25,6 +25,7 @@ def make_card(
     module: Objective,
     rows: list[dict[str, float]],
     device: str,
+    n_processes: int = 1,
 ) -> dict[str, Any]:
     """A model card; free of times and paths, so that equal runs write equal cards.
 
@@ -34,12 +35,13 @@ def make_card(
     :param module: the trained objective
     :param rows: of the log
     :param device: type of the device that it was trained on
+    :param n_processes: that trained it together
     """
     # A callback may have been there for some of the rows only.
     names = dict.fromkeys(name for row in rows for name in row)
     return {
         "settings": settings,
-        "commands": reproducing_commands(settings, config, dataset),
+        "commands": reproducing_commands(settings, config, dataset, n_processes),
         "dataset": {
             "hash": dataset.hash,
             "env_id": dataset.env_id,
@@ -53,6 +55,8 @@ def make_card(
         "curves": {name: [row.get(name) for row in rows] for name in names},
         "versions": {"python": platform.python_version(), "torch": th.__version__.split("+")[0]},
         "device": device,
+        # As in cards from before there could be several.
+        **({"n_processes": n_processes} if n_processes > 1 else {}),
     }
 
 
@@ -100,12 +104,15 @@ def refuse_to_replace(path: Path) -> None:
         raise ValueError(f"the model card would replace {path}, which is not one; name another output") from error
 
 
-def reproducing_commands(settings: dict[str, Any], config: PretrainConfig, dataset: TransitionDataset) -> list[str]:
+def reproducing_commands(
+    settings: dict[str, Any], config: PretrainConfig, dataset: TransitionDataset, n_processes: int = 1
+) -> list[str]:
     """The commands that make an encoder again, with DATA, BASE and FILE for the paths.
 
     :param settings: of the run, with objective and seed
     :param config: its settings by name
     :param dataset: that it was trained on
+    :param n_processes: that trained it together
     """
     commands, meta = [], dataset.meta
     # Data that was imported has no command that would collect it again.
@@ -118,7 +125,8 @@ def reproducing_commands(settings: dict[str, Any], config: PretrainConfig, datas
     words = ["--objective", settings["objective"], "--env", dataset.env_id, "--seed", str(settings["seed"])]
     words += ["--data", "DATA", "-o", "FILE"] + (["--base", "BASE"] if "base_hash" in settings else [])
     words += ["-params", *(f"{name}:{json.dumps(value)}" for name, value in config.as_settings().items())]
-    commands.append(f"sb3-abisim pretrain {shlex.join(words)}")
+    program = f"torchrun --nproc-per-node {n_processes} -m sb3_abisim" if n_processes > 1 else "sb3-abisim"
+    commands.append(f"{program} pretrain {shlex.join(words)}")
     return commands
 
 

@@ -8,9 +8,10 @@ same machine type, package versions, device type and thread count).
 """
 
 import argparse
+import contextlib
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ _BASE = "base."
 
 if TYPE_CHECKING:
     from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.pretraining.ranks import Ranks
     from sb3_abisim.pretraining.track import Tracking
     from sb3_abisim.pretraining.trainer import Callback
 
@@ -65,16 +67,11 @@ def pretrain(
     :raises ValueError: if the output belongs to other settings, or anything does not fit together
     :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
     """
-    from sb3_abisim.common.files import folder_lock, remove_temporaries
     from sb3_abisim.common.malloc import keep_freed_memory
-    from sb3_abisim.data.dataset import TransitionDataset
-    from sb3_abisim.data.image_warning import warn_of_images
-    from sb3_abisim.networks.base import make_encoder
     from sb3_abisim.pretraining.card import refuse_to_replace
-    from sb3_abisim.pretraining.trainer import PretrainRun, make_objective
+    from sb3_abisim.pretraining.ranks import processes
 
     get_objective(objective)
-    base_method = get_method(objective).base
     if seed < 0:
         raise ValueError(f"seed must be at least 0, got {seed}")
     keep_freed_memory()
@@ -88,9 +85,42 @@ def pretrain(
         config, base_settings = _split_base_settings(config or {})
         _check_base_settings(base_settings, objective, base)
         config = load_config(objective, env_id, config)
+    with processes(device) as ranks:
+        quiet = not ranks.is_first
+        _pretrain(
+            objective, data, output, config, base, base_settings, seed, device, progress_bar and not quiet,
+            0 if quiet else verbose, callback, keep_checkpoint, track, ranks,
+        )  # fmt: skip
+    return output
+
+
+def _pretrain(
+    objective: str,
+    data: str | Path,
+    output: Path,
+    config: PretrainConfig,
+    base: str | None,
+    base_settings: dict[str, Any],
+    seed: int,
+    device: str,
+    progress_bar: bool,
+    verbose: int,
+    callback: "Callback | None",
+    keep_checkpoint: bool,
+    track: "Tracking | None",
+    ranks: "Ranks",
+) -> None:
+    """:func:`pretrain` in one of the processes."""
+    from sb3_abisim.data.dataset import TransitionDataset
+    from sb3_abisim.data.image_warning import warn_of_images
+    from sb3_abisim.networks.base import make_encoder
+    from sb3_abisim.pretraining.trainer import PretrainRun, make_objective
+
+    base_method = get_method(objective).base
     dataset = TransitionDataset(data, eval_fraction=config.eval_fraction)
     _check_parts(dataset, config)
-    warn_of_images(dataset, stacklevel=2)
+    if ranks.is_first:
+        warn_of_images(dataset, stacklevel=3)
     if base_method is not None and base is None:
         base = str(output.with_name(f"{output.stem}.base.safetensors"))
         # Mistakes in the settings of this objective are found before the base is trained.
@@ -98,7 +128,7 @@ def pretrain(
         stand_in = make_encoder(dataset.observation_space, config.network, **base_network_kwargs)
         make_objective(objective, dataset, config, stand_in)
         # Of the same network and data, whatever this one is asked to have.
-        base_config = load_config(base_method, env_id, base_settings)
+        base_config = load_config(base_method, dataset.env_id, base_settings)
         batch_size = base_config.batch_size
         base_config = dataclasses.replace(
             base_config,
@@ -111,22 +141,33 @@ def pretrain(
     if base_method is None and base is not None:
         raise ValueError(f"{objective!r} builds on no base encoder, got base={base!r}; leave it out")
     folder = output.with_suffix(".run")
+    with contextlib.ExitStack() as stack:
+        if ranks.is_first:
+            stack.enter_context(_held(folder))
+        run = PretrainRun(
+            objective, dataset, output, config, base, seed, device, callback, keep_checkpoint, track, ranks
+        )
+        if not run.is_finished():
+            run.train(progress_bar, verbose)
+        elif ranks.is_first:
+            run.clean_up()
+            if verbose:
+                print(f"{output} is finished already; nothing to do")
+
+
+@contextlib.contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold the folder of a run, made if need be; what was refused at once leaves no empty one behind."""
+    from sb3_abisim.common.files import folder_lock, remove_temporaries
+
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with folder_lock(folder):
             remove_temporaries(folder)
-            run = PretrainRun(objective, dataset, output, config, base, seed, device, callback, keep_checkpoint, track)
-            if run.is_finished():
-                run.clean_up()
-                if verbose:
-                    print(f"{output} is finished already; nothing to do")
-                return output
-            run.train(progress_bar, verbose)
+            yield
     finally:
-        # What was refused at once leaves no empty folder behind.
         if not any(folder.iterdir()):
             folder.rmdir()
-    return output
 
 
 def _split_base_settings(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

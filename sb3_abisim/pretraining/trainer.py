@@ -26,6 +26,7 @@ from sb3_abisim.pretraining.checkpoint import (
     refuse_other_settings,
 )
 from sb3_abisim.pretraining.config import FOLLOWING, N_EVAL_BATCHES, PretrainConfig
+from sb3_abisim.pretraining.ranks import Ranks
 from sb3_abisim.pretraining.track import Tracking
 from sb3_abisim.registry import get_objective
 
@@ -77,6 +78,7 @@ class PretrainRun:
     :param callback: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
     :param keep_checkpoint: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
     :param track: see :func:`~sb3_abisim.pretraining.pretrain.pretrain`
+    :param ranks: the processes of the run, None for this one alone; only the first of them writes
     """
 
     def __init__(
@@ -91,8 +93,10 @@ class PretrainRun:
         callback: Callback | None = None,
         keep_checkpoint: bool = False,
         track: Tracking | None = None,
+        ranks: Ranks | None = None,
     ) -> None:
         self.keep_checkpoint, self.track = keep_checkpoint, track
+        self.ranks = ranks or Ranks()
         self.dataset, self.output, self.config, self.seed = dataset, output, config, seed
         self.callback = callback
         self.folder = output.with_suffix(".run")
@@ -160,6 +164,9 @@ class PretrainRun:
         """
         th.manual_seed(self.seed)
         self.n_updates, self.rows = self.checkpoints.restore(self.module, self.optimizer)
+        self.ranks.require_equal(self.n_updates)
+        frames = th.as_tensor(self._some_frames(N_REFERENCE)).to(self.device)
+        self.ranks.require_independent_rows(self.module, preprocess(frames, self.dataset.observation_space))
         if not self.n_updates:
             frames = th.as_tensor(self._some_frames(N_STANDARDIZE, "train")).to(self.device)
             self.module.prepare(preprocess(frames, self.dataset.observation_space))
@@ -193,11 +200,15 @@ class PretrainRun:
             bar.close()
             with naming(self.folder):
                 logger.close()
-        self.finish()
+        if self.ranks.is_first:
+            self.finish()
+        # What comes next may need the file.
+        self.ranks.wait()
 
     def save(self) -> None:
         """Write a checkpoint."""
-        self.checkpoints.save(self.module, self.optimizer, self.n_updates, self.rows)
+        if self.ranks.is_first:
+            self.checkpoints.save(self.module, self.optimizer, self.n_updates, self.rows)
         self._saved_at = self.n_updates
 
     def finish(self) -> None:
@@ -206,7 +217,7 @@ class PretrainRun:
             self.save()
         dataset, encoder = self.dataset, self.module.encoder.cpu().eval()
         encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
-        card = make_card(self.settings, self.config, dataset, self.module, self.rows, self.device.type)
+        card = make_card(self.settings, self.config, dataset, self.module, self.rows, self.device.type, self.ranks.size)
         write_card(self.output.with_suffix(".json"), card)
         save_encoder(
             self.output,
@@ -239,9 +250,11 @@ class PretrainRun:
         self.module.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate_at(self.n_updates)
-        loss, terms = self.module.loss(batch)
+        with self.ranks.share(self.module):
+            loss, terms = self.module.loss(batch)
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
+        self.ranks.average_gradients(self._trained)
         gradients = [parameter.grad for parameter in self._trained if parameter.grad is not None]
         self._require_finite({"loss": loss, **terms, "gradient norm": th.nn.utils.get_total_norm(gradients)})
         self.optimizer.step()
@@ -306,14 +319,14 @@ class PretrainRun:
         self.module.eval()
         means: dict[str, float] = {}
         batches = self._pass(min(self.config.batch_size, self._n_eval()), "eval")
-        with th.no_grad(), th.random.fork_rng(devices=[]):
+        with th.no_grad(), th.random.fork_rng(devices=[]), self.ranks.share(self.module):
             rows = [self.module.loss(self._to_tensors(b))[1] for b in itertools.islice(batches, N_EVAL_BATCHES)]
         for name in rows[0] if rows else ():
             means[name] = sum(float(row[name]) for row in rows) / len(rows)
         return means
 
     def _called_back(self) -> dict[str, float]:
-        if self.callback is None:
+        if self.callback is None or not self.ranks.is_first:
             return {}
         self.module.eval()
         # Whatever it samples, training goes on as without it.
@@ -322,6 +335,8 @@ class PretrainRun:
 
     def _logger(self, verbose: int) -> Logger:
         """SB3's logger, with the rows of an interrupted run written again so that the table is whole."""
+        if not self.ranks.is_first:
+            return Logger(None, [])
         # First, since it may be refused.
         tracked = [self.track.start(self.folder, self.dataset.env_id, self.settings)] if self.track else []
         formats = ["csv", "tensorboard"] + (["stdout"] if verbose else [])
