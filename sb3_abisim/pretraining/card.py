@@ -145,8 +145,21 @@ def warn_at_chance(
     if accuracy <= chance + max(0.005, 3 * math.sqrt(chance * (1 - chance) / n)):
         warnings.warn(
             f"{output}: {name} ended at {accuracy:.3g}, no better than guessing ({chance:.3g}), so the encoder has "
-            "learned nothing of its objective; try more updates, another seed, a smaller l1_penalty or, for ssi and "
-            "acro, a delta_scale above 1. Where one frame does not show what an action does, as with velocities, "
-            "collect with --frame-stack 4",
+            f"learned nothing of its objective; {advice(module)}. Where one frame does not show what an action does, "
+            "as with velocities, collect with --frame-stack 4",
             stacklevel=2,
         )
+
+
+def advice(module: Objective) -> str:
+    """What to try where nothing was learned, as part of a message.
+
+    :param module: the trained objective
+    """
+    settings = module.remedies()
+    if not settings:
+        return "try more updates or another seed"
+    return (
+        f"try -params {' '.join(settings)} (each with base. in front, for the base of another encoder), more updates "
+        "or another seed"
+    )

@@ -17,7 +17,7 @@ from sb3_abisim.data.dataset import Split, TransitionDataset
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess, set_memory_format
 from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
-from sb3_abisim.pretraining.card import make_card, warn_at_chance, write_card
+from sb3_abisim.pretraining.card import advice, make_card, warn_at_chance, write_card
 from sb3_abisim.pretraining.checkpoint import (
     Checkpoints,
     asks_for_more_updates,
@@ -201,7 +201,10 @@ class PretrainRun:
         if self.keep_checkpoint and self._saved_at < self.n_updates:
             self.save()
         dataset, encoder = self.dataset, self.module.encoder.cpu().eval()
-        encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
+        try:
+            encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
+        except ValueError as error:
+            raise ValueError(f"{error}; {advice(self.module)}; name another output or remove {self.folder}") from error
         card = make_card(self.settings, self.config, dataset, self.module, self.rows, self.device.type)
         write_card(self.output.with_suffix(".json"), card)
         save_encoder(

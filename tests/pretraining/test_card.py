@@ -1,6 +1,7 @@
 """The model card: what it says, and that an encoder which has learned nothing is not handed over without a warning."""
 
 import json
+import re
 import shlex
 import warnings
 
@@ -8,14 +9,19 @@ import pytest
 from pretrain_inputs import collect_grids, make_run
 
 from sb3_abisim.__main__ import main as sb3_abisim
+from sb3_abisim.common.cli import parse_pairs
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.card import read_card, warn_at_chance
 from sb3_abisim.pretraining.config import load_config
 from sb3_abisim.pretraining.pretrain import pretrain
+from sb3_abisim.pretraining.trainer import PretrainRun
 
 # Learns nothing.
 SETTINGS = {"n_updates": 10, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5, "learning_rate": 1e-9}
+
+FORM = "objective_kwargs.adaptive:chance_corrected"
+QUIET = {"device": "cpu", "progress_bar": False, "verbose": 0}
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +39,44 @@ def test_warns_when_nothing_was_learned(data, tmp_path, eval_fraction, name):
     with pytest.warns(UserWarning, match=rf"ssi.safetensors: {name} .* no better than guessing \(0.25\)"):
         output = run(data, tmp_path / "ssi.safetensors", eval_fraction=eval_fraction)
     assert load_encoder(str(output)).metadata["objective"] == "ssi"
+
+
+@pytest.mark.parametrize(
+    ("objective", "given", "settings"),
+    [
+        ("ssi", {"l1_penalty": 0.01, "adaptive": "paper", "delta_scale": 1.0},
+         f"objective_kwargs.l1_penalty:0.001 objective_kwargs.delta_scale:3.0 {FORM}"),
+        ("acro", {"l1_penalty": 0.0, "adaptive": None, "delta_scale": 1.0}, "objective_kwargs.delta_scale:3.0"),
+        ("ssi", {"l1_penalty": 0.001, "adaptive": None, "delta_scale": 7.0}, FORM),
+        ("ssi", {"l1_penalty": 0.001, "adaptive": "chance_corrected", "delta_scale": 3.0}, ""),
+        ("info_nce", {"l1_penalty": 0.1}, "objective_kwargs.l1_penalty:0"),
+        ("info_nce", {}, ""),
+    ],
+)  # fmt: skip
+def test_an_embedding_that_collapsed_is_refused_with_the_settings_to_try(
+    data, tmp_path, monkeypatch, objective, given, settings
+):
+    plain = PretrainRun._update
+
+    def collapse(self, batch):
+        terms = plain(self, batch)
+        for parameter in self.module.encoder.parameters():
+            parameter.data.zero_()
+        return terms
+
+    monkeypatch.setattr(PretrainRun, "_update", collapse)
+    words = (
+        re.escape(f"try -params {settings} (each with base. in front") if settings else "try more updates or another"
+    )
+    output = tmp_path / "e.safetensors"
+    with pytest.raises(
+        ValueError, match=f"the same for all observations: .*; {words}.*; name another output or remove"
+    ):
+        pretrain(objective, data, output, {**SETTINGS, "n_updates": 1, "objective_kwargs": given}, **QUIET)
+    assert not output.exists()
+    # What it says can be typed.
+    config = load_config(objective, "Nav2D-v0", parse_pairs(settings.split(), "-params"))
+    assert all(word.partition(":")[0].partition(".")[2] in config.objective_kwargs for word in settings.split())
 
 
 @pytest.mark.parametrize(("accuracy", "warns"), [(0.24, True), (0.37, True), (0.39, False), (0.95, False)])
