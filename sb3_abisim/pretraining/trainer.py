@@ -204,7 +204,8 @@ class PretrainRun:
         try:
             encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
         except ValueError as error:
-            raise ValueError(f"{error}; {advice(self.module)}; name another output or remove {self.folder}") from error
+            words = advice(self.module, dataset.preprocessing)
+            raise ValueError(f"{error}; name another output or remove {self.folder}, and {words}") from error
         card = make_card(self.settings, self.config, dataset, self.module, self.rows, self.device.type)
         write_card(self.output.with_suffix(".json"), card)
         save_encoder(
@@ -222,7 +223,7 @@ class PretrainRun:
             preprocessing={"env_wrapper": [], **dataset.preprocessing} if "preprocessing" in dataset.meta else None,
         )
         self.clean_up()
-        warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval())
+        warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval(), dataset.preprocessing)
 
     def _some_frames(self, n: int, split: Split | None = None) -> NDArray[np.uint8]:
         """Frames from all over the dataset, n of them unless there are fewer."""

@@ -65,12 +65,10 @@ def test_an_embedding_that_collapsed_is_refused_with_the_settings_to_try(
         return terms
 
     monkeypatch.setattr(PretrainRun, "_update", collapse)
-    words = (
-        re.escape(f"try -params {settings} (each with base. in front") if settings else "try more updates or another"
-    )
+    words = "try more updates or another seed" + re.escape(f", or -params {settings} (each with base." * bool(settings))
     output = tmp_path / "e.safetensors"
     with pytest.raises(
-        ValueError, match=f"the same for all observations: .*; {words}.*; name another output or remove"
+        ValueError, match=f"the same for all observations: .*; name another output or remove .*, and {words}"
     ):
         pretrain(objective, data, output, {**SETTINGS, "n_updates": 1, "objective_kwargs": given}, **QUIET)
     assert not output.exists()
@@ -85,8 +83,19 @@ def test_what_counts_as_guessing(data, accuracy, warns):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         # A hundred actions of the eval split: the standard error of a quarter is 0.043.
-        warn_at_chance(run.output, run.module, run.config, [{"n_updates": 10, "eval/accuracy": accuracy}], n_eval=100)
+        warn_at_chance(run.output, run.module, run.config, [{"n_updates": 10, "eval/accuracy": accuracy}], 100, {})
     assert bool(caught) == warns
+
+
+@pytest.mark.parametrize(
+    ("preprocessing", "advised"), [({}, True), ({"frame_stack": 1}, True), ({"frame_stack": 3}, False)]
+)
+def test_stacks_are_advised_where_there_are_none(data, preprocessing, advised):
+    run = make_run(data)
+    with pytest.warns(UserWarning, match="no better than guessing") as caught:
+        warn_at_chance(run.output, run.module, run.config, [{"eval/accuracy": 0.2}], 100, preprocessing)
+    assert ("One frame may not tell the action" in str(caught[0].message)) == advised
+    assert ("collect again with --frame-stack 4" in str(caught[0].message)) == advised
 
 
 def test_guessing_among_the_keys_of_the_eval_split(data):
@@ -94,10 +103,10 @@ def test_guessing_among_the_keys_of_the_eval_split(data):
     run = make_run(data, "curl", batch_size=256)
     rows = [{"n_updates": 10, "eval/accuracy": 0.03}]
     with pytest.warns(UserWarning, match=r"no better than guessing \(0.01\)"):
-        warn_at_chance(run.output, run.module, run.config, rows, n_eval=100)
+        warn_at_chance(run.output, run.module, run.config, rows, 100, {})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_at_chance(run.output, run.module, run.config, rows, n_eval=2000)
+        warn_at_chance(run.output, run.module, run.config, rows, 2000, {})
 
 
 def test_the_commands_on_the_card_make_the_same_encoder(data, tmp_path):
