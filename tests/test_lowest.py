@@ -4,6 +4,7 @@ import configparser
 import re
 from pathlib import Path
 
+import yaml
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
@@ -19,3 +20,13 @@ def test_constraints_are_the_lower_bounds() -> None:
     assert lowest.keys() == {name for name, bound in bounds.items() if bound}
     for name, version in lowest.items():
         assert Requirement(f"{name}=={bounds[name]}").specifier.contains(version), (name, version, bounds[name])
+
+
+def test_both_ends_run_in_ci() -> None:
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    assert jobs["test"]["strategy"]["matrix"]["target"] == ["test", "test-lowest"]
+    commands = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    assert any("${{ matrix.target }}" in command for command in commands)
+    targets = {word for command in commands for word in re.findall(r"[a-z-]+", command.split("PIP_FLAGS")[0])[1:]}
+    made = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    assert all(command.startswith("make ") for command in commands) and targets - {"matrix", "target"} <= made
