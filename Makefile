@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-lowest test-slow format lint type check docs bench reliability figures comparisons benchmark benchmark-smoke clean
+.PHONY: help setup demo test test-envs test-lowest test-slow format lint type check docs bench reliability figures comparisons benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -33,6 +33,16 @@ test-lowest: $(VENV)-lowest/.installed  ## the tests with the lowest versions th
 $(VENV)-lowest/.installed: setup.cfg constraints-lowest.txt
 	$(PYTHON) -m venv $(VENV)-lowest
 	$(VENV)-lowest/bin/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -c constraints-lowest.txt -e '.[tests]'
+	@touch $@
+
+# dm_control does not load beside MuJoCo 4. It renders through EGL (on Debian, libegl1).
+test-envs: $(VENV)-envs/.installed  ## the three commands on environments of other packages; half an hour
+	MUJOCO_GL=egl $(VENV)-envs/bin/python -m benchmarks.any_pixels
+
+$(VENV)-envs/.installed: setup.cfg
+	$(PYTHON) -m venv $(VENV)-envs
+	$(VENV)-envs/bin/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -e . \
+		ale-py 'gymnasium[box2d]' dm_control minigrid opencv-python-headless shimmy 'mujoco<4'
 	@touch $@
 
 test-slow: setup  ## the tests that take minutes
@@ -88,4 +98,4 @@ benchmark-smoke: setup  ## the same kinds of jobs and report with tiny budgets, 
 	$(BIN)/sb3-abisim benchmark -o benchmark-smoke $(SMOKE)
 
 clean:  ## remove the environment and caches
-	rm -rf $(VENV) $(VENV)-lowest .pytest_cache .mypy_cache .ruff_cache build site docs/api *.egg-info
+	rm -rf $(VENV) $(VENV)-envs $(VENV)-lowest .pytest_cache .mypy_cache .ruff_cache build site docs/api *.egg-info

@@ -1,9 +1,10 @@
 """The three commands on environments that nothing here names: what is done, what is refused, and what it takes.
 
 Each is run as a user would type it, in a process of its own, with budgets that show that it works and nothing else.
-Seconds are of processor time, memory is the process's largest. The packages are no dependencies of this one:
+Seconds are of processor time, memory is the process's largest. The packages are no dependencies of this one, and
+dm_control does not load beside MuJoCo 4. ``make test-envs`` installs them and runs this:
 
-    pip install minigrid ale-py "gymnasium[box2d]" dm_control shimmy opencv-python-headless
+    pip install minigrid ale-py "gymnasium[box2d]" dm_control shimmy opencv-python-headless "mujoco<4"
     MUJOCO_GL=egl python -m benchmarks.any_pixels
 
 A case that is done is kept in ``--work`` and not run again. ``--curves`` prints the commands of the comparison of each

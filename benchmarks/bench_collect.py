@@ -3,7 +3,8 @@
 ALE/Pong-v5 steps as single environments in Stable-Baselines3's ``AtariWrapper``, as rl-zoo3's entry has them, in one
 process and in several, and as ale-py's own vector environment, whose observations differ in their bytes. All of them
 show four frames of the emulator per transition (``frameskip``). A turn is measured by the clock, since work is done in
-other processes and threads. The speed of each is that of its fastest turn, the one least disturbed by other load.
+other processes and threads. The speed of each is that of its fastest turn, the one least disturbed by other load. What
+bounds all of them is the emulator, whose share of the processor time is measured.
 
 Stacks of four that a dataset makes while reading are compared with stacks that lie in the dataset, in pretraining by
 SSI. Here speed is by processor time, on one core. Needs ``pip install 'sb3_abisim[atari]'``.
@@ -24,6 +25,8 @@ import numpy as np
 from benchmarks.tables import machine, use_one_core, write_page
 
 RESULTS = Path(__file__).parent / "results" / "collect.md"
+# Frames of the emulator in a transition.
+SKIP = 4
 ATARI, ATARI_WRAPPER = "ALE/Pong-v5", "stable_baselines3.common.atari_wrappers.AtariWrapper"
 N_ENVS, N_WORKERS = 8, (2, 4)
 OWN = "ale-py's vector environment"
@@ -102,6 +105,39 @@ def measure_steps(rounds: int, seconds: float) -> list[str]:
     return [f"| {name} | {speed:,.0f} | {speed / first:.2f} |" for name, speed in speeds.items()]
 
 
+def measure_emulator(rounds: int, n_steps: int = 200) -> tuple[float, float]:
+    """Processor seconds of a transition in one process: of all that a wrapped environment does, and of the emulator."""
+    from stable_baselines3.common.atari_wrappers import AtariWrapper
+
+    env = AtariWrapper(gym.make(ATARI, frameskip=1))
+    env.reset(seed=0)
+    ale = gym.make(ATARI).unwrapped.ale  # type: ignore[attr-defined]
+    ale.reset_game()
+    generator, actions = np.random.default_rng(0), ale.getMinimalActionSet()
+
+    def wrapped() -> None:
+        _, _, terminated, truncated, _ = env.step(generator.integers(len(actions)))
+        if terminated or truncated:
+            env.reset()
+
+    def emulated() -> None:
+        action = actions[generator.integers(len(actions))]
+        for _ in range(SKIP):
+            ale.act(action)
+        if ale.game_over():
+            ale.reset_game()
+
+    fastest = {wrapped: np.inf, emulated: np.inf}
+    for _ in range(rounds):
+        for step in fastest:
+            start = time.process_time()
+            for _ in range(n_steps):
+                step()
+            fastest[step] = min(fastest[step], (time.process_time() - start) / n_steps)
+    env.close()
+    return fastest[wrapped], fastest[emulated]
+
+
 def measure_stacks(rounds: int, n_updates: int) -> dict[int, tuple[float, float]]:
     """Transitions per second of processor time, by ``chunk_length``: stacks that are made, stacks that are stored."""
     from benchmarks.bench_pretraining import BATCH_SIZE, make_run, ours
@@ -156,8 +192,13 @@ def main(argv: list[str] | None = None) -> None:
     n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     rows = measure_steps(args.rounds, args.seconds)
     use_one_core()
+    whole, emulator = measure_emulator(args.rounds)
     stacks = measure_stacks(args.rounds, args.updates)
     tail = [
+        f"What bounds it: of the {whole * 1e6:.0f} µs of processor time that a transition takes in one environment, "
+        f"the {SKIP} frames of the emulator take {emulator * 1e6:.0f} µs. So {n_cores} cores that do nothing else give "
+        f"at most {n_cores * whole / emulator:.1f} times the speed of one process, whatever steps the emulator.",
+        "",
         f"Stacks of {STACK} gray observations of 84 x 84 in pretraining (`ssi`, `nature`, one core), transitions per "
         f"second of processor time in the fastest of {args.rounds} turns of {args.updates} updates; at most {MOST:.0%} "
         "less is the aim.",

@@ -18,9 +18,18 @@ A column may be ``{COLUMN: HEADER}``. See :data:`COLUMNS` for what there is.
 
 A table over several comparisons has ``parts``, one for each column. Each is a description as above with one of
 ``columns``, and its ``rows`` lead from what the table calls a method to the label of its runs.
+
+What the commands of a comparison took, and how many actions its encoders predicted::
+
+    <!-- table
+    costs: minigrid_fourrooms               # a folder in benchmarks/results/comparison
+    curves: curves-MiniGrid-FourRooms-v0    # what `sb3-abisim analyze curves` wrote of its encoders; optional
+    -->
+    <!-- end -->
 """
 
 import argparse
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +43,8 @@ from sb3_abisim.benchmark.report.groups import Group, group_runs, labeled_runs
 from sb3_abisim.benchmark.report.tables import compare, time_to
 
 ROOT = Path(__file__).resolve().parent.parent
-RUNS = ROOT / "benchmarks" / "results" / "comparison"
+RESULTS = ROOT / "benchmarks" / "results"
+RUNS = RESULTS / "comparison"
 IMAGES = ROOT / "docs" / "images"
 TABLE = re.compile(r"(<!-- table\n(.*?)-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
@@ -152,6 +162,8 @@ def table(spec: dict[str, Any]) -> str:
     :return: lines of Markdown; none without columns
     :raises ValueError: for an unknown key, column or row, with what there is
     """
+    if "costs" in spec:
+        return costs(**spec)
     parts = spec.get("parts")
     _check_keys(spec, {"parts"} if parts else {"runs", "source", "reference", "rows", "columns", "figure"})
     if parts is None:
@@ -200,6 +212,51 @@ def _columns(spec: dict[str, Any]) -> tuple[list[str], dict[str, list[str]]]:
         for label, shown in rows.items()
     }
     return [header or COLUMNS[name][1](argument) for name, argument, header in parts], cells
+
+
+def costs(costs: str, curves: str | None = None) -> str:
+    """A table of the commands of a comparison: processor time, memory, and the accuracy of encoders.
+
+    :param costs: a folder of :data:`RUNS`
+    :param curves: stem of a file in :data:`RESULTS` with the curves of its encoders
+    :return: lines of Markdown
+    """
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for path in sorted((RUNS / costs / "jobs").glob("*.json")):
+        job = json.loads(path.read_bytes())
+        if job["kind"] in _COMMANDS:
+            groups.setdefault(_COMMANDS[job["kind"]](job["settings"]), []).append(job)
+    encoders = json.loads((RESULTS / f"{curves}.json").read_bytes())["encoders"] if curves else {}
+    accuracy = {
+        Path(name).stem: one["curves"]["eval/accuracy"][-1]
+        for name, one in encoders.items()
+        if "eval/accuracy" in one["curves"]
+    }
+    lines = ["| command | processor seconds | MiB | `eval/accuracy` | jobs |", "|---|---:|---:|---:|---:|"]
+    for name, jobs in sorted(groups.items()):
+        memory = [job["memory_mib"] for job in jobs if "memory_mib" in job]
+        reached = [accuracy[stem] for job in jobs if (stem := Path(job["output"]).stem) in accuracy]
+        seconds = [job["processor_seconds"] for job in jobs if "processor_seconds" in job]
+        cells = [
+            _plus_minus(seconds, 0) if seconds else "",
+            f"{max(memory):,}" if memory else "",
+            _plus_minus(reached, 2) if reached else "",
+            str(len(jobs)),
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+# By kind of a job, what a table calls its command; in the order of the commands.
+_COMMANDS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "data": lambda settings: f"`collect` {settings['n_transitions']:,} transitions",
+    "encoder": lambda settings: (
+        f"`pretrain` {settings['objective']}, {settings['n_updates']:,} updates of {settings['batch_size']:,}"
+    ),
+    "run": lambda settings: (
+        f"`train` {settings['algo']} on {settings['method']}, {settings['hyperparams']['n_timesteps']:,} steps"
+    ),
+}
 
 
 def _folder(word: str) -> str:

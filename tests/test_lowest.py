@@ -4,6 +4,7 @@ import configparser
 import re
 from pathlib import Path
 
+import yaml
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
@@ -19,3 +20,14 @@ def test_constraints_are_the_lower_bounds() -> None:
     assert lowest.keys() == {name for name, bound in bounds.items() if bound}
     for name, version in lowest.items():
         assert Requirement(f"{name}=={bounds[name]}").specifier.contains(version), (name, version, bounds[name])
+
+
+def test_both_ends_run_in_ci() -> None:
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    assert jobs["test"]["strategy"]["matrix"]["target"] == ["test", "test-lowest"]
+    commands = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    made = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    targets = {word for command in commands if command.startswith("make ") for word in command.split()[1:]}
+    words = {word for word in targets if re.fullmatch(r"[a-z-]+", word) and not word.startswith("-")}
+    assert words == {"test-envs", "lint", "type"} and words | {"test", "test-lowest"} <= set(made)
+    assert any(command.startswith("make ${{ matrix.target }} ") for command in commands)

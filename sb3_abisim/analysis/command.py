@@ -110,11 +110,14 @@ def _figure_parser(name: str) -> argparse.ArgumentParser:
     if figure.encoders:
         parser.add_argument("encoders", nargs="*", metavar="ENCODER", help=ENCODERS_HELP[figure.trained])
     parser.add_argument("--env", default=figure.env_ids[0], metavar="ID", help="environment (default: %(default)s)")
+    if figure.as_pretrained:
+        help = "of a Dict of observations, the image to show to encoders of imported data (default: what they know)"
+        parser.add_argument("--image-key", metavar="KEY", help=help)
     if figure.of_data is not None:
         help = "look at this dataset of sb3-abisim collect instead of new episodes"
         parser.add_argument("--data", type=Path, metavar="DIR", help=help)
     parser.add_argument("-n", type=int, default=figure.size, help=f"{figure.unit} (default: %(default)s)")
-    parser.set_defaults(name=name)
+    parser.set_defaults(name=name, image_key=None)
     _add_folders(parser)
     return parser
 
@@ -125,7 +128,7 @@ def _figure(args: argparse.Namespace) -> None:
     files = {}
     if one.encoders:
         names = args.encoders or default_encoders(args.env, trained if one.trained else None)
-        files = load_all(names, args.env, one.as_pretrained)
+        files = load_all(names, args.env, one.as_pretrained, args.image_key)
     data = args.data if one.of_data is not None else None
     env_id = args.env if data is None else read_env_id(data)
     path = make_figure(args.name, files, env_id, args.n, args.images, _numbers(args), data)

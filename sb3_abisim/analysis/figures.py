@@ -1,5 +1,6 @@
 """The table of figures: how each is computed and plotted, and how it is made from encoder names."""
 
+import dataclasses
 import json
 import math
 import re
@@ -110,15 +111,19 @@ def default_encoders(env_id: str, trained: Path | None = None) -> list[str]:
     return names
 
 
-def load_all(names: list[str], env_id: str, as_pretrained: bool = False) -> dict[str, EncoderFile]:
+def load_all(
+    names: list[str], env_id: str, as_pretrained: bool = False, image_key: str | None = None
+) -> dict[str, EncoderFile]:
     """Encoders by name, checked against the environment's observations.
 
     :param names: files or names
     :param env_id: a registered id
     :param as_pretrained: see :class:`Figure`
+    :param image_key: the image of a ``Dict`` to show to encoders of recordings, whose files do not know the
+        environment's names; None for what the files know
     :raises ValueError: for an unknown id, or encoders of other observations
     """
-    files = {name: load_encoder(name) for name in names}
+    files = {name: _with_image_key(load_encoder(name), image_key) for name in names}
     preprocessing = preprocessing_of(files) if as_pretrained else Preprocessing()
     env_kwargs = next(iter(eval_settings(env_id, files).values())) if as_pretrained else {}
     env = make_vector_env(env_id, 1, env_kwargs, preprocessing)
@@ -127,6 +132,18 @@ def load_all(names: list[str], env_id: str, as_pretrained: bool = False) -> dict
     for file in files.values():
         file.check(Box(0, 255, (preprocessing.frame_stack * n_channels, *size), np.uint8))
     return files
+
+
+def _with_image_key(file: EncoderFile, image_key: str | None) -> EncoderFile:
+    preprocessing = file.metadata["preprocessing"]
+    known = preprocessing.get("image_key")
+    if image_key is None or image_key == known:
+        return file
+    if known is not None:
+        raise ValueError(f"{file.path} was pretrained on the image {known!r}, not {image_key!r}; leave --image-key out")
+    return dataclasses.replace(
+        file, metadata={**file.metadata, "preprocessing": {**preprocessing, "image_key": image_key}}
+    )
 
 
 def make_figure(

@@ -87,5 +87,9 @@ class Objective(nn.Module):
         """
         return None
 
+    def remedies(self) -> list[str]:
+        """Settings to try where nothing was learned, such as "objective_kwargs.l1_penalty:0", unless they hold."""
+        return []
+
     def after_step(self) -> None:
         """Called after each optimizer step, for target networks and schedules."""

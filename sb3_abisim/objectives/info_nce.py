@@ -88,6 +88,10 @@ class InfoNCE(Objective):
         """
         return 1.0 / min(batch_size, self.actions.count**self.k)
 
+    def remedies(self) -> list[str]:
+        """To do without the penalty."""
+        return ["objective_kwargs.l1_penalty:0"] if self.l1_penalty else []
+
     def loss(self, batch: TensorBatch) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """InfoNCE; terms ``info_nce``, ``l1_norm`` and ``accuracy`` (share of actions found among the candidates).
 

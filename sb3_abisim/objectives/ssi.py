@@ -29,6 +29,9 @@ from sb3_abisim.registry import register_method
 
 ADAPTIVE_FORMS = ("paper", "released", "chance_corrected")
 HIDDEN_DIM = 256
+# What to try where nothing was learned.
+LIGHT_PENALTY = 0.001
+LARGE_DELTA_SCALE = 3.0
 
 
 def inverse_dynamics_loss(
@@ -125,6 +128,17 @@ class InverseDynamics(Objective):
         :param batch_size: makes no difference
         """
         return self.actions.chance
+
+    def remedies(self) -> list[str]:
+        """The settings of Nav2D, with which embeddings left zero that the penalty would have held there."""
+        found = []
+        if self.l1_penalty > LIGHT_PENALTY:
+            found.append(f"objective_kwargs.l1_penalty:{LIGHT_PENALTY}")
+        if self.delta_scale < LARGE_DELTA_SCALE:
+            found.append(f"objective_kwargs.delta_scale:{LARGE_DELTA_SCALE}")
+        if self.l1_penalty > 0 and self.adaptive != "chance_corrected":
+            found.append("objective_kwargs.adaptive:chance_corrected")
+        return found
 
 
 register_method("ssi", InverseDynamics, label="single-step inverse dynamics", extractor="SSIExtractor", color="#009E73")

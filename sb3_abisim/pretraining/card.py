@@ -131,7 +131,12 @@ def reproducing_commands(
 
 
 def warn_at_chance(
-    output: Path, module: Objective, config: PretrainConfig, rows: list[dict[str, float]], n_eval: int
+    output: Path,
+    module: Objective,
+    config: PretrainConfig,
+    rows: list[dict[str, float]],
+    n_eval: int,
+    preprocessing: dict[str, Any],
 ) -> None:
     """Warn of an encoder that has learned nothing: it looks like any other file.
 
@@ -140,6 +145,7 @@ def warn_at_chance(
     :param config: the settings
     :param rows: of the log
     :param n_eval: transitions of the eval split
+    :param preprocessing: of the dataset
     """
     name = "eval/accuracy" if config.eval_fraction else "train/accuracy"
     accuracy = rows[-1].get(name) if rows else None
@@ -153,8 +159,25 @@ def warn_at_chance(
     if accuracy <= chance + max(0.005, 3 * math.sqrt(chance * (1 - chance) / n)):
         warnings.warn(
             f"{output}: {name} ended at {accuracy:.3g}, no better than guessing ({chance:.3g}), so the encoder has "
-            "learned nothing of its objective; try more updates, another seed, a smaller l1_penalty or, for ssi and "
-            "acro, a delta_scale above 1. Where one frame does not show what an action does, as with velocities, "
-            "collect with --frame-stack 4",
+            f"learned nothing of its objective; {advice(module, preprocessing)}",
             stacklevel=2,
         )
+
+
+def advice(module: Objective, preprocessing: dict[str, Any]) -> str:
+    """What to try where nothing was learned, as part of a message.
+
+    That one frame cannot tell the action is not seen in the data by cheaper means than by learning to tell it.
+
+    :param module: the trained objective
+    :param preprocessing: of the dataset
+    """
+    settings, words = module.remedies(), "try more updates or another seed"
+    if settings:
+        words += f", or -params {' '.join(settings)} (each with base. in front, for the base of another encoder)"
+    if preprocessing.get("frame_stack", 1) == 1:
+        words += (
+            ". One frame may not tell the action, as where actions change velocities: then collect again with "
+            "--frame-stack 4"
+        )
+    return words

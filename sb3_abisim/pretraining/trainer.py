@@ -18,7 +18,7 @@ from sb3_abisim.data.dataset import Split, TransitionDataset
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess, set_memory_format
 from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
-from sb3_abisim.pretraining.card import make_card, warn_at_chance, write_card
+from sb3_abisim.pretraining.card import advice, make_card, warn_at_chance, write_card
 from sb3_abisim.pretraining.checkpoint import (
     Checkpoints,
     asks_for_more_updates,
@@ -216,7 +216,11 @@ class PretrainRun:
         if self.keep_checkpoint and self._saved_at < self.n_updates:
             self.save()
         dataset, encoder = self.dataset, self.module.encoder.cpu().eval()
-        encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
+        try:
+            encoder.standardize(preprocess(self._some_frames(N_STANDARDIZE, "train"), dataset.observation_space))
+        except ValueError as error:
+            words = advice(self.module, dataset.preprocessing)
+            raise ValueError(f"{error}; name another output or remove {self.folder}, and {words}") from error
         card = make_card(self.settings, self.config, dataset, self.module, self.rows, self.device.type, self.ranks.size)
         write_card(self.output.with_suffix(".json"), card)
         save_encoder(
@@ -234,7 +238,7 @@ class PretrainRun:
             preprocessing={"env_wrapper": [], **dataset.preprocessing} if "preprocessing" in dataset.meta else None,
         )
         self.clean_up()
-        warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval())
+        warn_at_chance(self.output, self.module, self.config, self.rows, self._n_eval(), dataset.preprocessing)
 
     def _some_frames(self, n: int, split: Split | None = None) -> NDArray[np.uint8]:
         """Frames from all over the dataset, n of them unless there are fewer."""

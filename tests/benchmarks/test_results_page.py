@@ -1,7 +1,9 @@
 """The tables of docs/ say what the committed runs say."""
 
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -114,3 +116,33 @@ def test_steps_that_not_all_runs_reach_are_bounds() -> None:
     assert "runs reach it" in lines[3] or "not within" in lines[3]
     assert "not within 200,000" in lines[4]
     assert lines[4].split("|")[3].strip().startswith(("at most", "neither"))
+
+
+def test_what_the_commands_took(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def write(name: str, kind: str, settings: dict[str, Any], **more: Any) -> None:
+        path = tmp_path / "comparison" / "small" / "jobs" / f"{name}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        job = {"kind": kind, "settings": settings, "output": f"made/{name}.safetensors", **more}
+        path.write_text(json.dumps(job))
+
+    monkeypatch.setattr(results_page, "RESULTS", tmp_path)
+    monkeypatch.setattr(results_page, "RUNS", tmp_path / "comparison")
+    write("data-1", "data", {"n_transitions": 5000}, processor_seconds=12.4, memory_mib=400)
+    for seed, (seconds, memory) in enumerate([(10.0, 2000), (20.0, 1500)]):
+        settings = {"objective": "ssi", "n_updates": 600, "batch_size": 128, "seed": seed}
+        write(f"ssi-{seed}", "encoder", settings, processor_seconds=seconds, memory_mib=memory)
+    write("run-1", "run", {"algo": "ppo", "method": "vanilla", "hyperparams": {"n_timesteps": 1000}}, seconds=3.0)
+    write("final-1", "final", {"n_episodes": 5}, processor_seconds=99.0)
+    encoders = {
+        f"files/ssi-{seed}.safetensors": {"curves": {"eval/accuracy": [0.1, reached]}}
+        for seed, reached in ((0, 0.5), (1, 0.7))
+    }
+    encoders["files/other.safetensors"] = {"curves": {"train/loss": [1.0]}}
+    (tmp_path / "curves-small.json").write_text(json.dumps({"encoders": encoders}))
+    lines = results_page.table({"costs": "small", "curves": "curves-small"}).splitlines()
+    assert lines[2] == "| `collect` 5,000 transitions | 12 | 400 |  | 1 |"
+    assert re.fullmatch(
+        r"\| `pretrain` ssi, 600 updates of 128 \| 15 ± \d+ \| 2,000 \| 0\.60 ± 1\.27 \| 2 \|", lines[3]
+    )
+    assert lines[4] == "| `train` ppo on vanilla, 1,000 steps |  |  |  | 1 |"
+    assert len(lines) == 5

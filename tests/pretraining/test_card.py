@@ -1,6 +1,7 @@
 """The model card: what it says, and that an encoder which has learned nothing is not handed over without a warning."""
 
 import json
+import re
 import shlex
 import warnings
 
@@ -8,14 +9,19 @@ import pytest
 from pretrain_inputs import collect_grids, make_run
 
 from sb3_abisim.__main__ import main as sb3_abisim
+from sb3_abisim.common.cli import parse_pairs
 from sb3_abisim.data.dataset import TransitionDataset
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.card import read_card, warn_at_chance
 from sb3_abisim.pretraining.config import load_config
 from sb3_abisim.pretraining.pretrain import pretrain
+from sb3_abisim.pretraining.trainer import PretrainRun
 
 # Learns nothing.
 SETTINGS = {"n_updates": 10, "batch_size": 32, "log_interval": 5, "checkpoint_interval": 5, "learning_rate": 1e-9}
+
+FORM = "objective_kwargs.adaptive:chance_corrected"
+QUIET = {"device": "cpu", "progress_bar": False, "verbose": 0}
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +41,61 @@ def test_warns_when_nothing_was_learned(data, tmp_path, eval_fraction, name):
     assert load_encoder(str(output)).metadata["objective"] == "ssi"
 
 
+@pytest.mark.parametrize(
+    ("objective", "given", "settings"),
+    [
+        ("ssi", {"l1_penalty": 0.01, "adaptive": "paper", "delta_scale": 1.0},
+         f"objective_kwargs.l1_penalty:0.001 objective_kwargs.delta_scale:3.0 {FORM}"),
+        ("acro", {"l1_penalty": 0.0, "adaptive": None, "delta_scale": 1.0}, "objective_kwargs.delta_scale:3.0"),
+        ("ssi", {"l1_penalty": 0.001, "adaptive": None, "delta_scale": 7.0}, FORM),
+        ("ssi", {"l1_penalty": 0.001, "adaptive": "chance_corrected", "delta_scale": 3.0}, ""),
+        ("info_nce", {"l1_penalty": 0.1}, "objective_kwargs.l1_penalty:0"),
+        ("info_nce", {}, ""),
+    ],
+)  # fmt: skip
+def test_an_embedding_that_collapsed_is_refused_with_the_settings_to_try(
+    data, tmp_path, monkeypatch, objective, given, settings
+):
+    plain = PretrainRun._update
+
+    def collapse(self, batch):
+        terms = plain(self, batch)
+        for parameter in self.module.encoder.parameters():
+            parameter.data.zero_()
+        return terms
+
+    monkeypatch.setattr(PretrainRun, "_update", collapse)
+    words = "try more updates or another seed" + re.escape(f", or -params {settings} (each with base." * bool(settings))
+    output = tmp_path / "e.safetensors"
+    with pytest.raises(
+        ValueError, match=f"the same for all observations: .*; name another output or remove .*, and {words}"
+    ):
+        pretrain(objective, data, output, {**SETTINGS, "n_updates": 1, "objective_kwargs": given}, **QUIET)
+    assert not output.exists()
+    # What it says can be typed.
+    config = load_config(objective, "Nav2D-v0", parse_pairs(settings.split(), "-params"))
+    assert all(word.partition(":")[0].partition(".")[2] in config.objective_kwargs for word in settings.split())
+
+
 @pytest.mark.parametrize(("accuracy", "warns"), [(0.24, True), (0.37, True), (0.39, False), (0.95, False)])
 def test_what_counts_as_guessing(data, accuracy, warns):
     run = make_run(data)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         # A hundred actions of the eval split: the standard error of a quarter is 0.043.
-        warn_at_chance(run.output, run.module, run.config, [{"n_updates": 10, "eval/accuracy": accuracy}], n_eval=100)
+        warn_at_chance(run.output, run.module, run.config, [{"n_updates": 10, "eval/accuracy": accuracy}], 100, {})
     assert bool(caught) == warns
+
+
+@pytest.mark.parametrize(
+    ("preprocessing", "advised"), [({}, True), ({"frame_stack": 1}, True), ({"frame_stack": 3}, False)]
+)
+def test_stacks_are_advised_where_there_are_none(data, preprocessing, advised):
+    run = make_run(data)
+    with pytest.warns(UserWarning, match="no better than guessing") as caught:
+        warn_at_chance(run.output, run.module, run.config, [{"eval/accuracy": 0.2}], 100, preprocessing)
+    assert ("One frame may not tell the action" in str(caught[0].message)) == advised
+    assert ("collect again with --frame-stack 4" in str(caught[0].message)) == advised
 
 
 def test_guessing_among_the_keys_of_the_eval_split(data):
@@ -50,10 +103,10 @@ def test_guessing_among_the_keys_of_the_eval_split(data):
     run = make_run(data, "curl", batch_size=256)
     rows = [{"n_updates": 10, "eval/accuracy": 0.03}]
     with pytest.warns(UserWarning, match=r"no better than guessing \(0.01\)"):
-        warn_at_chance(run.output, run.module, run.config, rows, n_eval=100)
+        warn_at_chance(run.output, run.module, run.config, rows, 100, {})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_at_chance(run.output, run.module, run.config, rows, n_eval=2000)
+        warn_at_chance(run.output, run.module, run.config, rows, 2000, {})
 
 
 def test_the_commands_on_the_card_make_the_same_encoder(data, tmp_path):

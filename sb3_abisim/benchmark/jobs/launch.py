@@ -9,6 +9,7 @@ import json
 import os
 import platform
 import re
+import resource
 import shutil
 import signal
 import socket
@@ -153,6 +154,7 @@ def _run(root: Path, work: Path, job: dict[str, Any]) -> None:
         "seconds": round(time.monotonic() - start, 1),
         # Of the command and all that it waited for: it says more where other programs run beside it.
         "processor_seconds": round(sum(spent[2:4]) - sum(used[2:4]), 2),
+        "memory_mib": _largest_mib(),
         "source": source,
         "host": socket.gethostname(),
         "versions": {"sb3_abisim": __version__, "python": platform.python_version(), **_versions()},
@@ -164,6 +166,12 @@ def _run(root: Path, work: Path, job: dict[str, Any]) -> None:
     if made != output:
         # After the manifest: a kill in between leaves no folder that would stand in the way.
         made.rename(output)
+
+
+def _largest_mib() -> int:
+    """The most memory that the command, or one of the programs that it waited for, has had."""
+    most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    return round(most / (2**20 if sys.platform == "darwin" else 2**10))
 
 
 def _versions() -> dict[str, str]:

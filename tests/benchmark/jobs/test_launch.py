@@ -34,6 +34,8 @@ def test_a_job_in_a_program_of_its_own(tmp_path: Path) -> None:
     manifest = json.loads((tmp_path / "jobs" / f"{good.name}.json").read_bytes())
     assert manifest["source"] == source_hash("encoder")
     assert 0 < manifest["processor_seconds"] < manifest["seconds"] + 60
+    # A program of the standard library, not this process.
+    assert 5 < manifest["memory_mib"] < 100
     assert (
         manifest["versions"]["torch"]
         and manifest["hardware"]["processor"]
