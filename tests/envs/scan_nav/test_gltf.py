@@ -87,13 +87,13 @@ def quantized_to_fractions(gltf):
 
 def instanced(gltf):
     gltf.header["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
-    half = np.float32(0.5)
     places = {
         "TRANSLATION": gltf.accessor(np.array([[0, 0, 0], [6, 0, 5]], np.float32)),
         "ROTATION": gltf.accessor(np.array([[0, 0, 0, 1], [0, 1, 0, 0]], np.float32)),  # half a turn about y
-        "SCALE": gltf.accessor(np.array([[half, 1, 1], [half, 1, 1]], np.float32)),
+        "SCALE": gltf.accessor(np.array([[2, 1, 1], [2, 1, 1]], np.float32)),
     }
-    gltf.node(gltf.primitive(), extensions={"EXT_mesh_gpu_instancing": {"attributes": places}})
+    quarter = FLOOR * np.float32([0.25, 1, 1])
+    gltf.node(gltf.primitive(quarter), extensions={"EXT_mesh_gpu_instancing": {"attributes": places}})
 
 
 def morphed(gltf):
