@@ -208,12 +208,17 @@ class GltfScene:
         tint = colors[faces][..., :3] if colors is not None and look.tinted else None
         uv = self._coordinates(attributes.get(f"TEXCOORD_{look.tex_coord}"), look, n_vertices)
         shown = look.factor
-        if look.texture is not None and uv is not None:
+        if look.texture is not None and uv is None:
+            # Where the texture lies is not said; the factor beside it is mostly left at white.
+            self.n_bare += tint is None
+            shown = np.array(MISSING_COLOR, dtype=np.float32) if tint is None else shown
+        elif look.texture is not None:
+            assert uv is not None
             if look.texture not in self._textures:
                 self._textures[look.texture] = read_texture(file, self._images, look.texture)
             image, wrap = self._textures[look.texture]
             if image is not None:
-                if opacity is not None:
+                if opacity is not None and look.veiled:
                     opacity = Opacity(opacity.cutoff, opacity.alpha, image[1][1])
                 return Surface(n, self._images.shaded(image[0], look.factor), uv[faces], tint, wrap, opacity)
             shown, tint = np.array(MISSING_COLOR, dtype=np.float32), None
@@ -249,6 +254,9 @@ class GltfScene:
         """Of a texture, v upwards."""
         if accessor is None or look.texture is None:
             return None
+        entry = self._file.item("accessors", accessor)
+        if entry.get("componentType") != 5126 and not entry.get("normalized") and not self._file.quantized:
+            raise self._file.bad("has coordinates of a texture as whole numbers that are not normalized")
         uv = self._file.fractions(accessor, "VEC2")
         if len(uv) != n_vertices or not np.isfinite(uv).all():
             raise self._file.bad("is damaged: the coordinates of a texture are not those of its vertices")

@@ -11,6 +11,7 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,8 @@ class GltfFile:
         if not version.startswith("2.") or least != "2.0":
             raise SceneError(f"{path} is of glTF version {version or 'none'}, not 2.0; export it again as glTF 2.0")
         self._check_extensions()
+        # Then coordinates of textures may be whole numbers, which a transform scales.
+        self.quantized = "KHR_mesh_quantization" in self.header.get("extensionsUsed", [])
         self._buffers: dict[int, bytes | memoryview] = {}
 
     def _open_glb(self, data: bytes) -> bytes:
@@ -178,7 +181,7 @@ class GltfFile:
             if not kind.endswith(";base64"):
                 raise self.bad(f"holds {what} in another form than base64")
             try:
-                return base64.b64decode(text, validate=True)
+                return base64.b64decode(unquote(text), validate=True)
             except binascii.Error as error:
                 raise self.bad(f"holds {what} in damaged base64") from error
         found = self.files.find(uri)

@@ -27,6 +27,7 @@ class Look:
     :param alpha: the material's factor, 0..1
     :param cutoff: where alpha counts, the least of what is there; None for opaque
     :param tinted: whether the colors of vertices multiply it
+    :param veiled: whether the texture's alpha counts, which that of emitted light does not
     """
 
     factor: NDArray[np.float32]
@@ -37,6 +38,7 @@ class Look:
     alpha: float = 1.0
     cutoff: float | None = None
     tinted: bool = True
+    veiled: bool = True
 
 
 def plain_look() -> Look:
@@ -87,6 +89,7 @@ def read_look(file: GltfFile, material: dict[str, Any]) -> Look:
         alpha,
         cutoff,
         tinted,
+        reference is not material.get("emissiveTexture"),
     )
 
 

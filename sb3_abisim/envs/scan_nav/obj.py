@@ -151,7 +151,7 @@ class ObjFile:
             chosen = np.flatnonzero(counts == count)
             rows = lines if len(present) == 1 else [lines[k] for k in chosen.tolist()]
             try:
-                values[chosen, :count] = np.array(b" ".join(rows).split(), dtype=np.float64).reshape(-1, count)
+                values[chosen, :count] = np.array(_numerals(rows), dtype=np.float64).reshape(-1, count)
             except ValueError as error:
                 raise self._bad(f"has {what} that are not numbers ({error}); export it again") from error
         return values
@@ -159,6 +159,10 @@ class ObjFile:
     def _vertices(self) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
         """Positions, and colors in 0..255 with nan where a vertex has none."""
         values = self._numbers(self._positions, (3, 4, 6), "vertices")
+        # A fourth number is a weight; of six, three are a color.
+        weights = values[np.isnan(values[:, 4:]).all(axis=1), 3] if values.shape[1] > 3 else np.ones(0)
+        if (weights[~np.isnan(weights)] != 1).any():
+            raise self._bad("has vertices with a weight other than 1, which programs read in two ways; export it again")
         if values.shape[1] < 6:
             return values[:, :3], None
         colors = values[:, 3:]
@@ -170,10 +174,12 @@ class ObjFile:
         lengths = np.fromiter(map(len, map(bytes.split, self._faces)), dtype=np.int64, count=len(self._faces))
         if lengths.min() < 3:
             raise self._bad(f"has a face of {lengths.min()} corners; export it again")
-        tokens = b" ".join(self._faces).split()
-        slashes = {token.count(b"/") for token in tokens}
-        corners = np.zeros((len(tokens), 2), dtype=np.int64)
+        corners = np.zeros((int(lengths.sum()), 2), dtype=np.int64)
         try:
+            tokens = _numerals(self._faces)
+            slashes = {token.count(b"/") for token in tokens}
+            if max(slashes) > 2:
+                raise ValueError("a corner of more than three")
             if slashes == {0}:
                 corners[:, 0] = np.array(tokens, dtype=np.int64)
             elif len(slashes) == 1 and slashes <= {1, 2} and not any(token.endswith(b"/") for token in tokens):
@@ -227,7 +233,7 @@ class ObjFile:
     ) -> Surface:
         assert texture.found is not None
         if np.isnan(where).any():
-            raise self._bad("has a texture whose coordinates are single numbers; export it again")
+            raise self._bad("has a texture whose coordinates are no pairs of numbers; export it again")
         rgb, _ = self._images.read(texture.found)
         if opacity is not None and material.alpha_texture is not None:
             opacity = Opacity(opacity.cutoff, opacity.alpha, self._veil(material.alpha_texture, texture, rgb.shape[:2]))
@@ -266,3 +272,11 @@ class ObjFile:
         self._any_gray |= base is None and (known is None or not known.all())
         shown = np.broadcast_to(plain, (*faces.shape, 3))
         return shown if known is None else np.where(known[..., None], colors[faces], shown)  # type: ignore[index]
+
+
+def _numerals(lines: list[bytes]) -> list[bytes]:
+    """The words of all lines. Python takes 1_0 for ten, other programs for one."""
+    text = b" ".join(lines)
+    if b"_" in text:
+        raise ValueError("a '_' within one")
+    return text.split()

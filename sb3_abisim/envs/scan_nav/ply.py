@@ -68,8 +68,8 @@ class PlyFile:
             return []
         faces = corners[triangles]
         colors = self._colors(vertex, face, faces, owners)
-        where = self._coordinates(vertex, face, corners, lengths, triangles)
-        if where is None or not names:
+        where = self._coordinates(vertex, face, corners, lengths, triangles) if names else None
+        if where is None:
             return [(vertices, faces, self._plain(colors, vertex, face, len(faces)))]
         return self._textured(names, vertices, faces, owners, where, colors, face)
 
@@ -129,6 +129,7 @@ class PlyFile:
         """Texture coordinates of the corners of triangles, nan where a face has none; None without any."""
         if "texcoord" in face.lists:
             values, counts = face.lists["texcoord"]
+            self._fractions(values)
             if ((counts != 2 * lengths) & (counts != 0)).any():
                 raise self._bad("has faces with other numbers of texture coordinates than corners; export it again")
             filled = np.full((len(corners), 2), np.nan, dtype=np.float32)
@@ -136,9 +137,19 @@ class PlyFile:
             return filled[triangles]
         for u, v in _COORDINATES:
             if u in vertex.columns and v in vertex.columns:
+                self._fractions(vertex.columns[u])
+                self._fractions(vertex.columns[v])
                 of_vertices = np.stack([vertex.columns[u], vertex.columns[v]], axis=1).astype(np.float32)
                 return of_vertices[corners[triangles]]
         return None
+
+    def _fractions(self, coordinates: NDArray[Any]) -> None:
+        """Whole numbers may be pixels, or shares of their largest number."""
+        if coordinates.dtype.kind != "f":
+            raise self._bad(
+                f"has coordinates of a texture of the type {coordinates.dtype.name}, and their unit is not known; "
+                "export them as floats in 0..1"
+            )
 
     def _textured(
         self,
@@ -152,7 +163,10 @@ class PlyFile:
     ) -> list[Part]:
         """One part per texture; faces without one (texnumber -1) keep their colors."""
         if "texnumber" in face.columns:
-            number = face.columns["texnumber"][owners].astype(np.int64)
+            given = face.columns["texnumber"][owners]
+            number = given.astype(np.int64)
+            if (number != given).any():
+                raise self._bad("has faces whose texnumber is not whole; export it again")
         elif len(names) == 1:
             number = np.zeros(len(faces), dtype=np.int64)
         else:

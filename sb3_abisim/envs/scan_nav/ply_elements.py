@@ -111,6 +111,8 @@ def _property(path: Path, line: str, words: list[str], order: str) -> Property:
 class _Text:
     def __init__(self, path: Path, data: bytes) -> None:
         self._path, self._words, self._at = path, data.split(), 0
+        if b"_" in data:  # Python takes 1_0 for ten, other programs for one
+            raise SceneError(f"{path} has what is not a number (a '_'); download or export it again")
 
     def _take(self, n: int) -> list[bytes]:
         words = self._words[self._at : self._at + n]

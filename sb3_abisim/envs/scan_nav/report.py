@@ -36,6 +36,7 @@ _HANGING_SHARE = 0.01
 _MAX_BELOW = 0.4
 _MIN_UP_SHARE = 0.15
 _MIN_WALKABLE_SHARE = 0.05
+UNKNOWN_UNIT = "taken for meters (no storey that would show it)"
 _UNITS = (("feet", 0.3048), ("decimeters", 0.1), ("inches", 0.0254), ("centimeters", 0.01), ("millimeters", 0.001))
 
 
@@ -54,7 +55,7 @@ class ScanReport:
     :param standing: level area between 0.2 and 1.3 m above the floor that faces up, less what faces down
     :param hanging: level area between 0.2 and 1.3 m below the ceiling that faces down, less what faces up
     :param below_share: of the area of all faces, what lies below the lowest floor
-    :param unit: "meters", or the unit in which the storey would be that of a house
+    :param unit: "meters", or the unit in which the storey would be that of a house; UNKNOWN_UNIT without a storey
     :param n_faces: that are not transparent
     :param n_transparent: faces that are left out, since one sees through them
     :param n_textures: decoded
@@ -231,7 +232,9 @@ def _storey(levels: _Levels, floors: list[float], base: float, floor_area: float
 
 def _unit(storey: float | None) -> str:
     """The unit in which a storey that is no house's would be one's."""
-    if storey is None or storey <= MAX_STOREY:
+    if storey is None:
+        return UNKNOWN_UNIT
+    if storey <= MAX_STOREY:
         return "meters"
     return next((name for name, meters in _UNITS if MIN_STOREY <= storey * meters <= MAX_STOREY), "unknown")
 

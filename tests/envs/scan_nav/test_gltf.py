@@ -87,13 +87,13 @@ def quantized_to_fractions(gltf):
 
 def instanced(gltf):
     gltf.header["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
-    half = np.float32(0.5)
     places = {
         "TRANSLATION": gltf.accessor(np.array([[0, 0, 0], [6, 0, 5]], np.float32)),
         "ROTATION": gltf.accessor(np.array([[0, 0, 0, 1], [0, 1, 0, 0]], np.float32)),  # half a turn about y
-        "SCALE": gltf.accessor(np.array([[half, 1, 1], [half, 1, 1]], np.float32)),
+        "SCALE": gltf.accessor(np.array([[2, 1, 1], [2, 1, 1]], np.float32)),
     }
-    gltf.node(gltf.primitive(), extensions={"EXT_mesh_gpu_instancing": {"attributes": places}})
+    quarter = FLOOR * np.float32([0.25, 1, 1])
+    gltf.node(gltf.primitive(quarter), extensions={"EXT_mesh_gpu_instancing": {"attributes": places}})
 
 
 def morphed(gltf):
@@ -144,7 +144,7 @@ def test_a_gltf_file_with_its_data_in_itself_or_beside_it(tmp_path):
     header = {**gltf.header, "buffers": [{"byteLength": len(gltf.data), "uri": "a%20b.bin"}]}
     (tmp_path / "a b.bin").write_bytes(gltf.data)
     (tmp_path / "beside.gltf").write_text(json.dumps(header))
-    text = "data:application/octet-stream;base64," + base64.b64encode(gltf.data).decode()
+    text = "data:application/octet-stream;base64," + base64.b64encode(gltf.data).decode().replace("A", "%41")
     header["buffers"][0]["uri"] = text
     (tmp_path / "inside.gltf").write_text(json.dumps(header))
     for name in ("beside", "inside"):
@@ -325,6 +325,36 @@ def test_coordinates_of_a_texture_may_be_fractions(tmp_path):
     assert [int(np.argmax(shown(gltf, path, 0.5, x))) for x in (0.25, 0.75)] == [0, 2]
 
 
+@pytest.mark.parametrize("quantized", [False, True])
+def test_whole_numbers_as_coordinates_of_a_texture_need_their_extension(tmp_path, quantized):
+    gltf = textured(Gltf(), RED_BLUE)
+    primitive = gltf.header["meshes"][0]["primitives"][0]
+    primitive["attributes"]["TEXCOORD_0"] = gltf.accessor((UV * 100).astype(np.uint16))
+    transform = {"extensions": {"KHR_texture_transform": {"scale": [0.01, 0.01]}}}
+    gltf.header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] |= transform
+    gltf.header["extensionsUsed"] = ["KHR_texture_transform"]
+    path = tmp_path / "a.glb"
+    if not quantized:
+        with pytest.raises(SceneError, match="coordinates of a texture as whole numbers that are not normalized"):
+            load_mesh(gltf.save(path))
+        return
+    gltf.header["extensionsUsed"].append("KHR_mesh_quantization")
+    assert [int(np.argmax(shown(gltf, path, 0.5, x))) for x in (0.25, 0.75)] == [0, 2]
+
+
+@pytest.mark.parametrize("tinted", [False, True])
+def test_a_texture_whose_coordinates_are_not_there_is_a_warning_and_gray(tmp_path, tinted):
+    gltf = textured(Gltf(), RED_BLUE)
+    attributes = gltf.header["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TEXCOORD_1"] = attributes.pop("TEXCOORD_0")
+    if tinted:
+        attributes["COLOR_0"] = gltf.accessor(np.tile(np.float32([0, 1, 0]), (4, 1)))
+        assert shown(gltf, tmp_path / "a.glb") == [0, 255, 0]
+        return
+    with pytest.warns(UserWarning, match="1 of 1 parts have no color"):
+        assert shown(gltf, tmp_path / "a.glb") == [160, 160, 160]
+
+
 @pytest.mark.parametrize(
     ("material", "expected"),
     [
@@ -414,6 +444,16 @@ def test_an_opaque_texture_has_no_holes(tmp_path):
     pixels = [(250, 0, 0, 255)] * 8 + [(250, 0, 0, 0)] * 8
     scan, _ = walkable_area(veiled({}, pixels), tmp_path / "a.glb")
     assert scan.orthophoto[150, 160].tolist() == [250, 0, 0]
+
+
+def test_the_alpha_of_light_given_off_makes_no_holes(tmp_path):
+    gltf = Gltf()
+    gltf.node(gltf.primitive(material=GREEN))
+    lamp = {"index": gltf.texture([[(250, 0, 0, 0)]])}
+    black = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]}, "alphaMode": "BLEND"}
+    gltf.node(gltf.primitive(TABLE, {**black, "emissiveTexture": lamp, "emissiveFactor": [1, 1, 1]}, uv=UV))
+    scan, _ = walkable_area(gltf, tmp_path / "a.glb")
+    assert scan.orthophoto[150, 125].tolist() == [250, 0, 0]
 
 
 def test_an_upright_sheet_stops_the_agent_where_it_is_solid(tmp_path):

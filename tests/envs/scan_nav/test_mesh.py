@@ -296,5 +296,6 @@ def test_a_part_without_coordinates_needs_no_texture(tmp_path):
         lambda header: header["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"),
         damage_image,
     )
-    (surface,) = load_mesh(path).surfaces
+    with pytest.warns(UserWarning, match="1 of 1 parts have no color"):
+        (surface,) = load_mesh(path).surfaces
     assert surface.texture is None

@@ -137,6 +137,12 @@ def test_a_map_of_transparency_makes_holes(folder):
     assert scan.orthophoto[125, 75].tolist() == list(RED) and scan.orthophoto[125, 250].tolist() == [0, 255, 0]
 
 
+def test_a_weight_of_one_and_faces_counted_from_the_end(folder):
+    weighted = GEOMETRY.replace("6 5 0", "6 5 0 1") + "f -4/-4 -3/-3 -2/-2 -1/-1\nv 90 90 90\n"
+    mesh = load(folder, "mtllib scan.mtl\nusemtl m\n" + weighted, "newmtl m\nmap_Kd a.png\n")
+    assert colors(mesh) == [RED] and mesh.vertices.max(axis=0).tolist() == [6, 5, 0]
+
+
 @pytest.mark.parametrize(
     ("text", "library", "message"),
     [
@@ -162,6 +168,15 @@ def test_a_map_of_transparency_makes_holes(folder):
         (TEXTURED, "newmtl m\nmap_Kd a.png\nmap_d gone.png\n", "refers to gone.png, its transparency"),
         (TEXTURED, "newmtl m\nmap_Kd " + "-o 1 " * 1000 + "\n", "statement 'map_kd' of 4999 letters, more than 4096"),
         ("v 0 0 0\0\n", None, "is not a text in UTF-8"),
+        (GEOMETRY.replace("6 5 0", "6_0 5 0") + "f 1 2 3 4\n", None, "vertices that are not numbers .a '_' within"),
+        (GEOMETRY + "f 1 2 1_0\n", None, "a face that is not whole numbers .a '_' within"),
+        (GEOMETRY + "f 1/1/1/1 2/2/1/1 3/3/1/1\n", None, "a corner of more than three"),
+        (
+            GEOMETRY.replace("6 5 0", "6 5 0 2") + "f 1 2 3 4\n",
+            None,
+            "a weight other than 1, which programs read in two",
+        ),
+        (vertices(["1 1 1"] * 4, "v 9 9 9 3\nf 1 2 3 4\n"), None, "a weight other than 1"),
     ],
     ids=lambda value: str(value)[-40:],
 )

@@ -108,6 +108,22 @@ def test_one_texture_with_coordinates_of_vertices(folder, names):
     assert np.allclose(surface.coordinates[0], UV[:3]) and halves(path) == (RED, RED)
 
 
+@pytest.mark.parametrize(
+    ("of_vertices", "of_faces", "message"),
+    [
+        (("uchar s", "uchar t"), (), "of the type uint8, and their unit is not known; export them as floats"),
+        ((), ("list uchar int texcoord",), "of the type int32, and their unit is not known"),
+        ((), ("list uchar float texcoord", "float texnumber"), "texnumber is not whole"),
+    ],
+)
+def test_whole_numbers_for_fractions_and_the_opposite_are_refused(folder, of_vertices, of_faces, message):
+    uv = [(255, 0)] * 8 if of_vertices else [()] * 8
+    faces = [()] * 4 if not of_faces else [(6, 1, 0, 0, 1, 1, 1, *([0.5] * (len(of_faces) - 1)))] * 4
+    path = ply(folder / "a.ply", uv, faces, of_vertices, of_faces, ["TextureFile red.png"])
+    with pytest.raises(SceneError, match=message):
+        load_mesh(path)
+
+
 def test_faces_without_a_texture_keep_their_colors(folder):
     numbered = [(*wedge, -1 if i < 2 else 1) for i, wedge in enumerate(WEDGES)]
     names = ("list uchar float texcoord", "int texnumber")
@@ -177,6 +193,7 @@ def swap(old, new):
         (swap("end_header", "element tristrips 1\nproperty list int int vertex_indices\nend_header"), "truncated"),
         (swap("property uchar red", "property char red"), "too large for its type"),
         (swap("uchar green", "float green"), "colors of vertices of several types"),
+        (swap("3 4 5 6", "3 4 5 0_6"), "what is not a number"),
     ],
 )
 def test_what_is_not_known_to_be_read_right_is_refused(tmp_path, edit, message):

@@ -141,6 +141,13 @@ def test_a_large_lean_is_refused_in_degrees(tmp_path):
         make(path, up="z")
 
 
+@pytest.mark.parametrize("scale", [1, 3.2808])
+def test_a_floor_alone_says_that_its_unit_is_not_known(tmp_path, scale, capsys):
+    ScanMap.from_mesh(save(tmp_path / "floor.ply", level(0, 0, 6, 5, 0), lambda v: v * scale), up="z", cache=False)
+    assert "no ceiling, no walls" in (text := capsys.readouterr().err)
+    assert "unit: taken for meters (no storey that would show it)" in text
+
+
 def test_a_noisy_floor_does_not_lean(tmp_path):
     """Its faces look everywhere, on average up: the points stay as they are."""
     rng = np.random.default_rng(0)
