@@ -30,11 +30,12 @@ DQN = {
 }
 
 
-def make_model(algo: str, kind: str) -> Any:
+def make_model(algo: str, kind: str, device: str = "cpu") -> Any:
     """A model of the zoo's hyperparameters on an encoder.
 
     :param algo: "ppo" or "dqn"
     :param kind: "fine-tuned" or "frozen" through the pixels, or "encoded" by the environment
+    :param device: of the model and of the encoder
     """
     import gymnasium as gym
     import stable_baselines3 as sb3
@@ -47,7 +48,7 @@ def make_model(algo: str, kind: str) -> Any:
     env = vec_env_class([lambda: gym.make(env_id)] * n_envs)
     policy_kwargs: dict[str, Any] = {"net_arch": [256], "activation_fn": nn.ReLU}
     if kind == "encoded":
-        env = VecEncodeObservations(env, f"{env_id}/abisim", device="cpu")
+        env = VecEncodeObservations(env, f"{env_id}/abisim", device=device)
     else:
         policy_kwargs["features_extractor_class"] = ActionBisimExtractor
         policy_kwargs["features_extractor_kwargs"] = {"encoder": f"{env_id}/abisim", "freeze": kind == "frozen"}
@@ -55,7 +56,7 @@ def make_model(algo: str, kind: str) -> Any:
         env = sb3.common.vec_env.VecNormalize(env, norm_obs=False)
     policy, kwargs = ("MlpPolicy" if kind == "encoded" else "CnnPolicy"), (PPO if algo == "ppo" else DQN)
     model_class = {"ppo": sb3.PPO, "dqn": sb3.DQN}[algo]
-    return model_class(policy, env, policy_kwargs=policy_kwargs, device="cpu", seed=0, **kwargs)
+    return model_class(policy, env, policy_kwargs=policy_kwargs, device=device, seed=0, **kwargs)
 
 
 def turns(model: Any, n_steps: int) -> Callable[[], tuple[float, float]]:

@@ -36,7 +36,7 @@ def straightforward(run: Any) -> Iterator[float]:
     dataset = run.dataset
     shards = [np.load(path, mmap_mode="r") for path in sorted(dataset.path.glob("frames-*.npy"))]
     offsets = np.cumsum([0] + [len(shard) for shard in shards])
-    starts = dataset.valid_starts(split="train")
+    starts, steps = dataset.pairs(run.config.k, "train")
     actions = dataset.actions(np.arange(dataset.n_frames))
 
     class Transitions(th.utils.data.Dataset[Any]):
@@ -44,17 +44,18 @@ def straightforward(run: Any) -> Iterator[float]:
             return len(starts)
 
         def __getitem__(self, i: int) -> Any:
-            t = starts[i]
+            t, k = starts[i], steps[i]
             shard = int(np.searchsorted(offsets, t, side="right")) - 1
-            pair = (shards[shard][t - offsets[shard] + k] for k in (0, 1))
+            pair = (shards[shard][t - offsets[shard] + step] for step in (0, k))
             frames = (th.from_numpy(frame.astype(np.float32)) / 255.0 for frame in pair)
-            return *frames, th.as_tensor(actions[t])
+            return *frames, th.as_tensor(actions[t : t + k] if module.reads_action_sequences else actions[t])
 
     module = run.module.to(memory_format=th.contiguous_format)
     module.train()
     optimizer = th.optim.Adam([p for p in module.parameters() if p.requires_grad], lr=1e-3)
     while True:
         for obs, next_obs, taken in th.utils.data.DataLoader(Transitions(), BATCH_SIZE, shuffle=True, drop_last=True):
+            obs, taken, next_obs = (tensor.to(run.device) for tensor in (obs, taken, next_obs))
             loss, _ = module.loss(TensorBatch.of(obs, taken, next_obs))
             optimizer.zero_grad()
             loss.backward()
@@ -69,7 +70,15 @@ def ours(run: Any) -> Iterator[float]:
         yield float(run._update(batch)["loss"])
 
 
-def make_run(objective: str, data: Path, base: str | None, folder: Path, chunk_length: int = 1) -> Any:
+def make_run(
+    objective: str,
+    data: Path,
+    base: str | None,
+    folder: Path,
+    chunk_length: int = 1,
+    device: str = "cpu",
+    settings: dict[str, Any] | None = None,
+) -> Any:
     """A pretraining run that has not begun."""
     from sb3_abisim.data.dataset import TransitionDataset
     from sb3_abisim.pretraining.config import load_config
@@ -77,9 +86,11 @@ def make_run(objective: str, data: Path, base: str | None, folder: Path, chunk_l
 
     dataset = TransitionDataset(data, verify=False)
     config = load_config(
-        objective, dataset.env_id, {"batch_size": BATCH_SIZE, "n_updates": 10**6, "chunk_length": chunk_length}
+        objective,
+        dataset.env_id,
+        {"batch_size": BATCH_SIZE, "n_updates": 10**6, "chunk_length": chunk_length, **(settings or {})},
     )
-    return PretrainRun(objective, dataset, folder / "x.safetensors", config, base, seed=0, device="cpu")
+    return PretrainRun(objective, dataset, folder / "x.safetensors", config, base, seed=0, device=device)
 
 
 def serve_turns(pipe: Any, objective: str, data: Path, base: str | None, chunk_length: int) -> None:

@@ -57,9 +57,15 @@ def register() -> None:
         register_network("batch_norm", _batch_norm)
 
 
+class _Agent(nn.Module):
+    """The agent's channel, of which every observation has one pixel: its statistics are the same in every batch."""
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return observations[:, :1]
+
+
 def _batch_norm(observation_space: Any) -> nn.Module:
-    n_channels = observation_space.shape[0]
-    return nn.Sequential(nn.BatchNorm2d(n_channels), nn.AdaptiveAvgPool2d(4), nn.Flatten())
+    return nn.Sequential(_Agent(), nn.BatchNorm2d(1), nn.AdaptiveAvgPool2d(4), nn.Flatten())
 
 
 def objectives() -> list[str]:

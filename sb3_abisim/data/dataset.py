@@ -1,9 +1,11 @@
 """Reads datasets: memory-mapped transitions (s_t, a_t, s_{t+k}) that never cross an episode's end.
 
-No frames are loaded. Per frame, the reader keeps 5 bytes plus the size of an action. Pages of the files that were read
-count as this process's memory until they are given back, which happens now and then.
+No frames are loaded. Per frame, the reader keeps 5 bytes plus the size of an action, one more where a split is asked
+for, and four more during a pass. Pages of the files that were read count as this process's memory until they are given
+back, which happens now and then.
 """
 
+import functools
 import mmap
 import os
 from collections import OrderedDict
@@ -156,8 +158,12 @@ class TransitionDataset:
         valid: NDArray[np.bool_] = self._remaining >= k
         if split is None:
             return valid
-        in_eval = frames_of_eval(self._last, self._before, self.eval_fraction)
-        return valid & (in_eval if split == "eval" else ~in_eval)
+        return valid & (self._in_eval if split == "eval" else ~self._in_eval)
+
+    @functools.cached_property
+    def _in_eval(self) -> NDArray[np.bool_]:
+        """Per frame, whether it belongs to the split "eval"; the log of pretraining asks for it at every row."""
+        return frames_of_eval(self._last, self._before, self.eval_fraction)
 
     def pairs(self, k: Steps = 1, split: Split | None = None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """All pairs of frames (t, t + steps) of the same episode.
@@ -170,7 +176,10 @@ class TransitionDataset:
         fewest, most = (k, k) if isinstance(k, int) else k
         if fewest > most:
             raise ValueError(f"k must be the fewest steps and the most, got {list(k)}")  # type: ignore[arg-type]
-        self.valid_starts(fewest, split)  # raises if there is no pair at all
+        first = self.valid_starts(fewest, split)  # raises if there is no pair at all
+        if fewest == most:
+            # One number takes no memory for each of millions of pairs.
+            return first, np.broadcast_to(np.int64(fewest), first.shape)
         steps = np.arange(fewest, most + 1)
         starts = [np.flatnonzero(self._has_steps(int(n), split)) for n in steps]
         return np.concatenate(starts), np.repeat(steps, [len(found) for found in starts])
@@ -241,12 +250,18 @@ class TransitionDataset:
             raise ValueError(f"batch_size {batch_size} exceeds the {len(starts)} transitions of {k} steps; lower it")
         # Sampled now and not at the first batch, so that mistakes raise here.
         generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, epoch])))
-        order = (
-            generator.permutation(len(starts))
-            if chunk_length == 1
-            else shuffle_chunks(starts, chunk_length, self._ends, self._last, generator)
-        )
-        return self._iterate(starts[order], steps[order], batch_size, start, sequences, chunk_length > 1)
+        if chunk_length == 1 and steps.strides == (0,):
+            # The same order as below. Where that is enough, four bytes for a transition instead of sixteen.
+            fits = self.n_frames <= np.iinfo(np.int32).max
+            starts = generator.permutation(starts.astype(np.int32) if fits else starts)
+        else:
+            order = (
+                generator.permutation(len(starts))
+                if chunk_length == 1
+                else shuffle_chunks(starts, chunk_length, self._ends, self._last, generator)
+            )
+            starts, steps = starts[order], steps[order]
+        return self._iterate(starts, steps, batch_size, start, sequences, chunk_length > 1)
 
     def _iterate(
         self,
@@ -259,7 +274,7 @@ class TransitionDataset:
     ) -> Iterator[TransitionBatch[NDArray[Any]]]:
         for i in range(start, len(starts) // batch_size):
             here = slice(i * batch_size, (i + 1) * batch_size)
-            index = starts[here]
+            index = starts[here].astype(np.int64)
             # Both frames of a pair lie close together on disk: one gather reads each page once.
             both = np.concatenate([index, index + steps[here]])
             obs_index: Any = slice(None, batch_size)

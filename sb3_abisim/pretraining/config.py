@@ -8,6 +8,8 @@ from sb3_abisim.common.method_settings import settings_entry
 
 # Batches of the eval split that a row of the log is the mean of.
 N_EVAL_BATCHES = 8
+# What encoders and decoders compute in while they train; the first is the default.
+PRECISIONS = ("float32", "bf16")
 # Arguments of an objective that follow from other settings.
 FOLLOWING = {"k", "encoder", "action_space", "base_encoder"}
 
@@ -24,6 +26,8 @@ class PretrainConfig:
         with a number of steps in this range
     :param chunk_length: batches are made of chunks of this many transitions that follow each other in an episode.
         Above 1, objectives that embed both observations have fewer to embed (docs/pretraining.md)
+    :param precision: "float32", or "bf16", which computes encoders and decoders in bfloat16 while they train
+        (docs/pretraining.md)
     :param eval_fraction: share of the episodes that is only evaluated on, 0 <= eval_fraction < 1
     :param log_interval: updates between two rows of the log
     :param checkpoint_interval: least updates between two checkpoints, each written at a row of the log
@@ -37,6 +41,7 @@ class PretrainConfig:
     learning_rate: float | str = 1e-4
     k: int | list[int] = 1
     chunk_length: int = 1
+    precision: str = PRECISIONS[0]
     eval_fraction: float = 0.05
     log_interval: int = 500
     checkpoint_interval: int = 1_000
@@ -56,6 +61,8 @@ class PretrainConfig:
             raise ValueError(f"learning_rate must be a number above 0, got {self.learning_rate!r}")
         if not isinstance(self.eval_fraction, int | float) or not 0 <= self.eval_fraction < 1:
             raise ValueError(f"eval_fraction must lie in [0, 1), got {self.eval_fraction!r}")
+        if self.precision not in PRECISIONS:
+            raise ValueError(f"precision must be one of {PRECISIONS}, got {self.precision!r}")
         for name in ("network_kwargs", "objective_kwargs"):
             if not isinstance(getattr(self, name), dict):
                 raise ValueError(f"{name} must be a mapping, got {getattr(self, name)!r}")
@@ -80,11 +87,13 @@ class PretrainConfig:
     def as_settings(self) -> dict[str, Any]:
         """The settings by name, as encoder files hold them.
 
-        Those of files from before ``chunk_length`` existed stay equal to those of the same run now.
+        Those of files from before ``chunk_length`` and ``precision`` existed stay equal to those of the same run now.
         """
         settings = dataclasses.asdict(self)
         if self.chunk_length == 1:
             del settings["chunk_length"]
+        if self.precision == PRECISIONS[0]:
+            del settings["precision"]
         return settings
 
     @classmethod

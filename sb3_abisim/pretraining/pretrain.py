@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_abisim.common.cli import make_parser, parse_pairs, run
-from sb3_abisim.pretraining.config import PretrainConfig, load_config
+from sb3_abisim.pretraining.config import PRECISIONS, PretrainConfig, load_config
 from sb3_abisim.registry import get_method, get_objective
 
 # In front of settings of the base encoder.
@@ -127,13 +127,14 @@ def _pretrain(
         base_network_kwargs = get_objective(objective).base_network_kwargs(config.network_kwargs)
         stand_in = make_encoder(dataset.observation_space, config.network, **base_network_kwargs)
         make_objective(objective, dataset, config, stand_in)
-        # Of the same network and data, whatever this one is asked to have.
+        # Of the same network and data, whatever this one is asked to have, and as precise unless asked otherwise.
         base_config = load_config(base_method, dataset.env_id, base_settings)
         batch_size = base_config.batch_size
         base_config = dataclasses.replace(
             base_config,
             network=config.network,
             network_kwargs=base_network_kwargs,
+            precision=base_settings.get("precision", config.precision),
             eval_fraction=config.eval_fraction,
             batch_size=batch_size if "batch_size" in base_settings else min(batch_size, config.batch_size),
         )
@@ -250,6 +251,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of weights and batches (default: %(default)s)")
     parser.add_argument("--device", default="auto", help="as in Stable-Baselines3 (default: %(default)s)")
     parser.add_argument(
+        "--precision",
+        choices=PRECISIONS,
+        help="of encoders while they train, the setting of this name (default: float32)",
+    )
+    parser.add_argument(
         "-params", "--params", nargs="+", action="extend", default=[], metavar="NAME:VALUE",
         help="replace settings, such as n_updates:1000 objective_kwargs.c:0.9; base.n_updates:1000 for the base",
     )  # fmt: skip
@@ -286,6 +292,8 @@ def _command(args: argparse.Namespace) -> None:
     if args.env is not None and env_id != args.env:
         raise ValueError(f"{data} was collected in {env_id}, not in {args.env}")
     settings = parse_pairs(args.params, "-params")
+    if args.precision is not None and settings.setdefault("precision", args.precision) != args.precision:
+        raise ValueError(f"--precision {args.precision} and -params precision:{settings['precision']} differ; give one")
     pretrain(
         args.objective, data, args.output, settings, args.base, args.seed, args.device,
         verbose=args.verbose, keep_checkpoint=args.keep_checkpoint, track=track,

@@ -11,7 +11,7 @@ import copy
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from datetime import timedelta
 from typing import Any
 
@@ -20,7 +20,7 @@ import torch.distributed as dist
 from torch import nn
 
 from sb3_abisim.networks.base import Encoder
-from sb3_abisim.networks.decoder import Decoder
+from sb3_abisim.pretraining.image_networks import Forward
 
 # What one process does alone is far shorter: it writes a checkpoint, or the encoder file.
 TIMEOUT = timedelta(minutes=30)
@@ -43,25 +43,16 @@ class Ranks:
         """Whether this process is the one that writes and prints."""
         return self.rank == 0
 
-    @contextlib.contextmanager
-    def share(self, module: nn.Module) -> Iterator[None]:
-        """Divide the rows of what encoders and decoders are given, for the duration of a ``with`` block.
+    def divide(self, forward: Forward) -> Forward:
+        """A network's ``forward`` that puts a share of the rows through it in each process, and gives all of them.
 
-        All processes must call them equally often, with the same rows.
+        All processes must call it equally often, with the same rows.
 
-        :param module: an objective
+        :param forward: from rows (n, ...) to rows (n, ...), each by itself
         """
-        parts = [part for part in module.modules() if isinstance(part, Encoder | Decoder)] if self.size > 1 else []
-        for part in parts:
-            # On the instance, so that names of weights and hooks stay as they are.
-            part.forward = self._shared(part.forward)  # type: ignore[method-assign, assignment]
-        try:
-            yield
-        finally:
-            for part in parts:
-                del part.forward
+        if self.size == 1:
+            return forward
 
-    def _shared(self, forward: Callable[[th.Tensor], th.Tensor]) -> Callable[[th.Tensor], th.Tensor]:
         def call(rows: th.Tensor) -> th.Tensor:
             n = len(rows)
             share = -(-n // self.size)

@@ -26,6 +26,7 @@ from sb3_abisim.pretraining.checkpoint import (
     refuse_other_settings,
 )
 from sb3_abisim.pretraining.config import FOLLOWING, N_EVAL_BATCHES, PretrainConfig
+from sb3_abisim.pretraining.image_networks import in_bfloat16, require_bfloat16, wrap_forward
 from sb3_abisim.pretraining.ranks import Ranks
 from sb3_abisim.pretraining.track import Tracking
 from sb3_abisim.registry import get_objective
@@ -101,6 +102,10 @@ class PretrainRun:
         self.callback = callback
         self.folder = output.with_suffix(".run")
         self.device = _device(device)
+        # Evaluated is what RL gets, in float32.
+        self._precision = [in_bfloat16] if config.precision == "bf16" else []
+        if self._precision:
+            require_bfloat16(self.device)
         self.settings: dict[str, Any] = {
             "objective": objective,
             "seed": seed,
@@ -254,7 +259,7 @@ class PretrainRun:
         self.module.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate_at(self.n_updates)
-        with self.ranks.share(self.module):
+        with wrap_forward(self.module, *self._precision, self.ranks.divide):
             loss, terms = self.module.loss(batch)
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -323,7 +328,7 @@ class PretrainRun:
         self.module.eval()
         means: dict[str, float] = {}
         batches = self._pass(min(self.config.batch_size, self._n_eval()), "eval")
-        with th.no_grad(), th.random.fork_rng(devices=[]), self.ranks.share(self.module):
+        with th.no_grad(), th.random.fork_rng(devices=[]), wrap_forward(self.module, self.ranks.divide):
             rows = [self.module.loss(self._to_tensors(b))[1] for b in itertools.islice(batches, N_EVAL_BATCHES)]
         for name in rows[0] if rows else ():
             means[name] = sum(float(row[name]) for row in rows) / len(rows)

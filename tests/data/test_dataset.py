@@ -480,10 +480,14 @@ def test_the_only_transition(tmp_path: Path) -> None:
 
 
 def test_what_is_in_memory_per_frame(dataset: TransitionDataset) -> None:
-    """Five bytes and an action, and something per segment."""
+    """Five bytes and an action, and something per segment; one more for a split, and four in a pass."""
     arrays = [value for value in vars(dataset).values() if isinstance(value, np.ndarray)]
     per_frame = [array for array in arrays if len(array) == dataset.n_frames]
     assert sum(array.nbytes for array in per_frame) == dataset.n_frames * (5 + dataset.actions([0]).nbytes)
+    in_pass = dataset.batches(16, split="train").gi_frame.f_locals  # type: ignore[attr-defined]
+    assert in_pass["starts"].nbytes == 4 * len(dataset.valid_starts(split="train"))
+    assert in_pass["steps"].base.nbytes == 8
+    assert dataset._in_eval is dataset._in_eval and dataset._in_eval.nbytes == dataset.n_frames
 
 
 def test_what_is_out_of_range_is_named(dataset: TransitionDataset) -> None:

@@ -1,0 +1,37 @@
+"""The script for machines with a GPU runs, at the least size, on a CPU."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import bench_frozen, bench_pretraining, gpu
+
+
+def test_it_writes_both_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (gpu, bench_pretraining):
+        monkeypatch.setattr(module, "BATCH_SIZE", 16)
+    monkeypatch.setattr(bench_frozen, "PPO", {**bench_frozen.PPO, "n_steps": 2, "batch_size": 32})
+    monkeypatch.setitem(gpu.RL_STEPS, "ppo", 32)
+    # Every kind of loop: pairs of single steps, of several, sequences of actions, a base and goals.
+    sizes = ["--transitions", "1500", "--rounds", "1", "--seconds", "0", "--rl-steps", "4"]
+    words = ["--device", "cpu", "--env", "Nav2D-v0", "--objectives", "acro", "info_nce", "goal_progress"]
+    gpu.main([*words, *sizes, "--arms", "straightforward", "float32", "bf16", "-o", str(tmp_path / "gpu.md")])
+    lines = (tmp_path / "gpu.md").read_text().splitlines()
+    rows = {line.split("|")[1].strip(): line.split("|")[2:-1] for line in lines if line.startswith("|")}
+    names = ["`acro`, Nav2D-v0", "`info_nce`, Nav2D-v0", "`goal_progress`, Nav2D-v0"]
+    for name in (*names, "PPO, DistractorPointMaze-v0", "DQN, Nav2D-v0"):
+        assert len(rows[name]) == 3
+        assert all(float(cell.split()[0].replace(",", "")) > 0 for cell in rows[name])
+
+
+def test_turns_alternate_and_count_what_a_call_does() -> None:
+    calls: list[str] = []
+    contenders = {name: (lambda name=name: calls.append(name)) for name in ("a", "b")}
+    found = gpu.in_turns(contenders, work=5, rounds=2, seconds=0, device="cpu")
+    assert calls == ["a", "b"] * 3 and [len(speeds) for speeds in found.values()] == [2, 2]
+
+
+def test_without_a_gpu_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        gpu.main([])
+    assert "give --device cpu" in capsys.readouterr().err
