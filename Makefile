@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-envs test-lowest test-slow format lint type check docs bench reliability figures comparisons benchmark benchmark-smoke clean
+.PHONY: help setup demo test test-envs test-lowest test-slow format lint type check docs bench times reliability figures comparisons benchmark benchmark-smoke clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -70,10 +70,26 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_pretraining
 	$(BIN)/python -m benchmarks.bench_memory
 	$(BIN)/python -m benchmarks.bench_frozen
+	$(BIN)/python -m benchmarks.bench_finetuning
 	$(BIN)/python -m benchmarks.bench_auxiliary
 	$(BIN)/python -m benchmarks.bench_scan_nav
 	$(BIN)/python -m benchmarks.bench_malloc
 	$(BIN)/python -m benchmarks.bench_collect
+	$(BIN)/python -m benchmarks.headline
+
+# From nothing: data and encoders are made inside, each job on one thread, one job at a time. One evaluation, at the end, since
+# the curves are those of the training episodes. With TIMES=FOLDER and the same flags, a run that was stopped goes on.
+TIMES := times
+TIMES_FLAGS := --methods vanilla abisim abisim,frozen goal_progress,frozen vanilla,auxiliary=ssi drq --seeds 0 1 2 \
+	--eval-episodes 20 --n-eval-envs 10 --final-episodes 50 --device cpu --threads 1 --jobs 1 --no-report
+TIMES_DISTRACTOR := --env DistractorPointMaze-v0 -n 131072 --eval-freq 131072 \
+	--params ppo.n_steps:128 ppo.batch_size:256 ppo.n_epochs:4 ppo.learning_rate:3e-4
+TIMES_NAV2D := --env Nav2D-v0 --algo ppo -n 131072 --eval-freq 131072
+
+times: setup  ## minutes from nothing to a trained agent, by method, into times/; hours; resumes
+	$(BIN)/sb3-abisim benchmark -o $(TIMES)/distractor $(TIMES_FLAGS) $(TIMES_DISTRACTOR)
+	$(BIN)/sb3-abisim benchmark -o $(TIMES)/nav2d $(TIMES_FLAGS) $(TIMES_NAV2D)
+	$(BIN)/python -m benchmarks.times $(TIMES)/distractor $(TIMES)/nav2d
 
 reliability: setup  ## damaged and hostile files, kills, steps and NaN, counted, into docs/limits.md; half an hour
 	$(BIN)/python -m benchmarks.reliability --seed 0

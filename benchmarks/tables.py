@@ -1,5 +1,6 @@
 """What the benchmarks share: one core, and a page with a table."""
 
+import itertools
 import os
 import platform
 from pathlib import Path
@@ -33,3 +34,19 @@ def write_page(
     print(page)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page)
+
+
+def read_table(page: str) -> list[dict[str, str]]:
+    """The first table of a page of Markdown.
+
+    :param page: its text
+    :return: of each row, header to cell
+    :raises ValueError: for a page without a table
+    """
+    lines = page.splitlines()
+    start = next((i for i, line in enumerate(lines) if line.startswith("|---")), None)
+    if start is None:
+        raise ValueError("a page without a table")
+    table = itertools.takewhile(lambda line: line.startswith("|"), lines[start - 1 :])
+    header, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
+    return [dict(zip(header, row, strict=True)) for row in rows]

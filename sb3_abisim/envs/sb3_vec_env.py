@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_abisim.envs.base import BatchEnv, SingleEnv
+from sb3_abisim.envs.plain_wrappers import PlainWrappers
 
 
 class BatchedVecEnv(DummyVecEnv):
@@ -53,6 +54,7 @@ class BatchedVecEnv(DummyVecEnv):
         self._rows = [_Row(self._batch, i) for i in range(self.num_envs)]
         for one, row in zip(copies, self._rows, strict=True):
             one.batch = row  # type: ignore[attr-defined]
+        self._wrappers = [PlainWrappers(env) for env in self.envs]
 
     def step_wait(self) -> VecEnvStepReturn:
         """Wait for the step that ``step_async`` began.
@@ -64,9 +66,55 @@ class BatchedVecEnv(DummyVecEnv):
         # Which copies have to be reset is for the rows to know.
         self._batch._needs_reset = False
         outcome = self._batch.step(self.actions)
+        if self._may_count(outcome):
+            return self._count(outcome)
         for row, action in zip(self._rows, self.actions, strict=True):
             row.prepare(action, outcome)
         return super().step_wait()
+
+    def _may_count(self, outcome: tuple[Any, ...]) -> bool:
+        """Whether the wrappers need not be called where no episode ends."""
+        observations, _, _, _, infos = outcome
+        return (
+            isinstance(observations, np.ndarray)
+            and all(array.ndim == 1 for array in infos.values())
+            and all(
+                wrappers.env is env and wrappers.are_plain()
+                for wrappers, env in zip(self._wrappers, self.envs, strict=True)
+            )
+        )
+
+    def _count(self, outcome: tuple[Any, ...]) -> VecEnvStepReturn:
+        """As ``DummyVecEnv.step_wait``, which calls every copy; here those alone whose episode ends are called."""
+        observations, rewards, terminated, _, infos = outcome
+        numbers, dones = rewards.tolist(), terminated.tolist()
+        columns = {name: array.tolist() for name, array in infos.items() if name[0] != "_"}
+        rows: list[dict[str, Any]] = []
+        for i, wrappers in enumerate(self._wrappers):
+            if dones[i] or wrappers.end_next():
+                dones[i], row = self._end(i, outcome)
+            else:
+                wrappers.count(numbers[i])
+                row = {name: column[i] for name, column in columns.items()}
+                row["TimeLimit.truncated"] = False
+            rows.append(row)
+        return observations, rewards.astype(np.float32), np.array(dones, dtype=bool), rows
+
+    def _end(self, i: int, outcome: tuple[Any, ...]) -> tuple[bool, dict[str, Any]]:
+        """Let one copy step through its wrappers, and begin its next episode if this one has ended.
+
+        :param i: which
+        :param outcome: of the batch's step; the first observation of the next episode is put in its place
+        :return: whether it has ended, and its infos
+        """
+        self._rows[i].prepare(self.actions[i], outcome)
+        observation, _, terminated, truncated, info = self.envs[i].step(self.actions[i])
+        info["TimeLimit.truncated"] = truncated and not terminated
+        if terminated or truncated:
+            # A view of the array that the next one is put into.
+            info["terminal_observation"] = observation.copy()
+            outcome[0][i], self.reset_infos[i] = self.envs[i].reset()
+        return terminated or truncated, copy.deepcopy(info)
 
 
 class _Row:

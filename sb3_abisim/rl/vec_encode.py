@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStac
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_abisim.common.images import ImageCheck
+from sb3_abisim.common.malloc import keep_freed_memory
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import embed, load_encoder
 from sb3_abisim.rl.file_network import check_objective
@@ -80,6 +81,8 @@ class VecEncodeObservations(VecEnvWrapper):
             venv = VecFrameStack(venv, n_stack, "first")
         file.check(venv.observation_space)
         super().__init__(venv, observation_space=EncodedBox(file.encoder.features_dim, file.hash))
+        # Every step embeds, and the layers' memory is the same each time.
+        keep_freed_memory()
         self.encoder_file = file
         self.source = encoder
         self._input_checked, self._image_check = False, ImageCheck()

@@ -142,8 +142,9 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
 
     def _set_batched_vec_env(self, hyperparams: dict[str, Any]) -> None:
         """Step copies as one batch where that gives the same as ``DummyVecEnv``; any other choice stays."""
-        several = hyperparams.get("n_envs", 1) > 1 and "env_wrapper" not in hyperparams
-        if several and self.vec_env_class is DummyVecEnv and batch_class(self.env_name.gym_id) is not None:
+        # One copy gains, too: its wrappers are called at the ends of episodes alone.
+        is_plain = "env_wrapper" not in hyperparams
+        if is_plain and self.vec_env_class is DummyVecEnv and batch_class(self.env_name.gym_id) is not None:
             self.vec_env_class = BatchedVecEnv
 
     def _set_eval_env_kwargs(self, hyperparams: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """The batched VecEnv against ``DummyVecEnv``: nothing differs but the speed."""
 
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -134,3 +135,72 @@ def test_wrappers_that_change_actions_are_noticed() -> None:
     env.reset()
     with pytest.raises(ValueError, match="use DummyVecEnv with wrappers that change actions"):
         env.step(np.zeros(3, int))
+
+
+def _count_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Of the outermost wrapper of Gymnasium's, from now on."""
+    calls = [0]
+    step = gym.wrappers.TimeLimit.step
+
+    def counted(self: Any, action: Any) -> Any:
+        calls[0] += 1
+        return step(self, action)
+
+    monkeypatch.setattr(gym.wrappers.TimeLimit, "step", counted)
+    return calls
+
+
+@pytest.mark.parametrize("module", ["gymnasium", "rl_zoo3.gym_patches"])
+def test_wrappers_are_called_at_the_ends_of_episodes_alone(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And hold afterwards what they would hold if they had been called; also with the time limit of rl-zoo3."""
+    importlib.import_module(module)
+    ours, theirs = (make("Nav2D-v0", cls) for cls in (BatchedVecEnv, DummyVecEnv))
+    actions = np.random.default_rng(0).integers(0, 4, (170, 3))
+    for env in (ours, theirs):
+        env.reset()
+    for action in actions[:3]:  # in which Gymnasium's checker looks at the environment
+        ours.step(action)
+    calls = _count_calls(monkeypatch)
+    ended = sum(ours.step(action)[2].sum() for action in actions[3:])
+    assert calls[0] == ended > 5
+    for action in actions:
+        theirs.step(action)
+    assert calls[0] == ended + actions.size
+    for one, other in zip(ours.envs, theirs.envs, strict=True):
+        for name in ("rewards", "total_steps", "needs_reset", "episode_returns", "episode_lengths"):
+            assert getattr(one, name) == getattr(other, name)
+        assert one.get_wrapper_attr("_elapsed_steps") == other.get_wrapper_attr("_elapsed_steps")
+
+
+class Doubled(gym.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> Any:
+        return 2 * reward
+
+
+@pytest.mark.parametrize("how", ["another wrapper", "another method", "another environment"])
+def test_anything_but_plain_wrappers_is_called(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make("Nav2D-v0", BatchedVecEnv, wrapper_class=Doubled if how == "another wrapper" else None)
+    env.reset()
+    if how == "another method":
+        monitor = env.envs[1]
+        monkeypatch.setattr(monitor, "step", monitor.step)
+    elif how == "another environment":
+        env.envs[1] = gym.Wrapper(env.envs[1])
+    for _ in range(3):
+        env.step(np.zeros(3, int))
+    calls = _count_calls(monkeypatch)
+    rewards = env.step(np.zeros(3, int))[1]
+    assert calls[0] == 3
+    assert set(rewards.tolist()) <= ({-2.0, 0.0} if how == "another wrapper" else {-1.0, 0.0})
+
+
+def test_what_is_returned_stays_as_it_is() -> None:
+    env = make("Nav2D-v0", BatchedVecEnv)
+    env.reset()
+    rng, kept = np.random.default_rng(0), []
+    for _ in range(60):
+        observations, _, _, infos = env.step(rng.integers(0, 4, 3))
+        terminal = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
+        kept += [(array, array.copy()) for array in (observations, *terminal)]
+    assert len(kept) > 60
+    assert all(np.array_equal(array, copied) for array, copied in kept)

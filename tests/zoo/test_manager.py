@@ -120,7 +120,7 @@ def test_frozen_puts_the_encoder_into_the_environment(manager: Any, algo: str, e
         assert frozen == default | {"policy": "MlpPolicy"}
 
 
-def test_several_environments_are_stepped_as_one_batch(manager: Any, tmp_path: Path) -> None:
+def test_environments_are_stepped_as_one_batch(manager: Any, tmp_path: Path) -> None:
     def vec_env_class(algo: str, env_id: str = "Nav2D-v0", config: str | None = None, **kwargs: Any) -> str:
         one = manager(algo, env_id, config, **kwargs)
         one.read_hyperparameters()
@@ -128,7 +128,7 @@ def test_several_environments_are_stepped_as_one_batch(manager: Any, tmp_path: P
 
     (tmp_path / "custom.yml").write_text("Nav2D-v0: {n_envs: 4, n_timesteps: 7, env_wrapper: some.Wrapper}\n")
     assert vec_env_class("ppo") == vec_env_class("ppo", config="vanilla") == "BatchedVecEnv"
-    assert vec_env_class("dqn") == vec_env_class("ppo", hyperparams={"n_envs": 1}) == "DummyVecEnv"
+    assert vec_env_class("dqn") == vec_env_class("ppo", hyperparams={"n_envs": 1}) == "BatchedVecEnv"
     assert vec_env_class("ppo", config=str(tmp_path / "custom.yml")) == "DummyVecEnv"
     assert vec_env_class("ppo", vec_env_type="subproc") == "SubprocVecEnv"
     assert vec_env_class("ppo", "CartPole-v1") == "DummyVecEnv"

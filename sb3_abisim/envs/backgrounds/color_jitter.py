@@ -48,6 +48,13 @@ class ColorJitter:
             for shown, channel in enumerate(channels):
                 turned[i, shown] = frames[i, channel, ::vertical, ::horizontal]
         first, last = self._first[indices], self._last[indices]
-        # Where a range is inverted, both products wrap at 2^16, and their sum is right again.
-        jittered: NDArray[np.uint8] = ((turned * (last - first) + np.uint16(256) * first) >> 8).astype(np.uint8)
-        return jittered
+        # Half of the jitters keep the range, and the arithmetic would leave their frames as they are.
+        changed = np.flatnonzero(((first != 0) | (last != 256)).any(axis=(1, 2, 3)))
+        if changed.size:
+            first, last = first[changed], last[changed]
+            # Where a range is inverted, both products wrap at 2^16, and their sum is right again.
+            jittered = turned[changed] * (last - first)
+            jittered += np.uint16(256) * first
+            jittered >>= 8
+            turned[changed] = jittered
+        return turned

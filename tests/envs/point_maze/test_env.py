@@ -114,6 +114,22 @@ def test_shortcuts_equal_the_plain_simulation(seed: int, continuous: bool) -> No
     assert 200 < n_simulated < 60 * 32 - 200
 
 
+def test_without_islands_nothing_moves_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the bit: the bytes of datasets hang on it."""
+    env = batch(32)
+    model = point_model()
+    assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ISLAND
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+    monkeypatch.setattr(point_maze, "point_model", lambda: model)
+    with_islands = batch(32)
+    generator = np.random.default_rng(0)
+    for _ in range(60):
+        actions = random_actions(env, generator)
+        for one in (env, with_islands):
+            one._advance(actions)
+        assert np.array_equal(env._position, with_islands._position)
+
+
 def test_free_displacement_for_any_force(point_xml: Path) -> None:
     forces = np.array([-1, -0.9, -0.69, -0.5, -0.01, 0, 0.3, 0.68, 0.7, 0.71, 0.75, 0.99, 1])
     model = mujoco.MjModel.from_xml_path(str(point_xml))
