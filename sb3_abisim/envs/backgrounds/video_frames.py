@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.images import too_many_passes
 from sb3_abisim.envs.backgrounds.clips import SIZE
 from sb3_abisim.envs.backgrounds.video_files import Source
 from sb3_abisim.envs.backgrounds.video_roles import NUMBERED
@@ -253,6 +254,8 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
     for file in source.files:
         with _decoding(file, source.path), image_module.open(file, formats=_FORMATS) as image:
             _require_size(image, file)
+            if too_many_passes(file.read_bytes(), *image.size):
+                raise ClipError(f"{file} has more scans than programs write; save it again, or remove {source.path}")
             if image.mode.startswith(("I", "F")):
                 raise ClipError(
                     f"{file} has more than 8 bits per value ({image.mode}); convert {source.path} to 8 bits"

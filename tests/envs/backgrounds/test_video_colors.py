@@ -1,5 +1,7 @@
 """Frames whose colors are not known to be read right, and those that are."""
 
+import io
+
 import numpy as np
 import pytest
 from video_inputs import Image, av, empty_cache, two_folders, videos_folder, write_frames  # noqa: F401
@@ -155,4 +157,14 @@ def test_a_gap_before_a_suffix_is_found(folder):
     for seed in range(2):
         write_frames(folder / str(seed), seed, [*range(10), *range(15, 25)], "{:03}_left.png")
     with pytest.raises(ClipError, match=r"20 of 25 frames: there is none between 009_left\.png and 015_left\.png"):
+        load_backgrounds(folder)
+
+
+def test_a_jpeg_of_countless_scans_is_not_decoded(folder):
+    two_folders(folder)
+    file = io.BytesIO()
+    Image.new("L", (80, 60)).save(file, "JPEG", progressive=True)
+    data = file.getvalue()
+    (folder / "b" / "frame5.png").write_bytes(data[:-2] + data[data.rindex(b"\xff\xda") : -2] * 420_000 + data[-2:])
+    with pytest.raises(ClipError, match=r"frame5\.png has more scans than programs write"):
         load_backgrounds(folder)
