@@ -19,7 +19,7 @@ MAX_IMAGE_SIDE = 8192
 MAX_IMAGE_PIXELS = 512_000_000  # of all textures together
 # A few bytes can declare an image of any size; these many pixels are granted in any case, and then so many per byte.
 FREE_IMAGE_PIXELS = 68_000_000
-IMAGE_PIXELS_PER_BYTE = 50
+IMAGE_PIXELS_PER_BYTE = 20
 _MAX_STEPS = 16  # folders of a path that are looked for
 _MAX_MISSING = 2000  # files that are looked for everywhere
 
