@@ -1,8 +1,10 @@
 """NumPy's .npz archives, whose declared shapes are compared with what is there before memory is taken."""
 
 import io
+import lzma
 import math
 import os
+import struct
 import tokenize
 import zipfile
 import zlib
@@ -17,7 +19,7 @@ MAX_BYTES = 1 << 28
 # What NumPy and zipfile raise, beside OSError, for bytes that are damaged: a header is parsed as Python.
 ARRAY_ERRORS = (
     EOFError, KeyError, ValueError, TypeError, IndexError, SyntaxError, NotImplementedError, RuntimeError, MemoryError,
-    OverflowError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+    OverflowError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError,
 )  # fmt: skip
 
 

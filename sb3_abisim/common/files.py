@@ -6,6 +6,7 @@ it when its holder dies, so that a kill leaves nothing to clean up by hand.
 """
 
 import contextlib
+import errno
 import hashlib
 import os
 import re
@@ -36,11 +37,15 @@ def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], ob
     :param size: bytes to reserve before writing, so that a full disk is found out at once; None reserves nothing.
         It must not exceed what ``write_fn`` writes
     :raises ValueError: for a device, a pipe or a folder
+    :raises PermissionError: for a file that may not be written
     :raises OSError: what the system says, ``errno.ENOSPC`` for a full disk; the temporary file is removed
     """
     path = Path(os.path.realpath(path))
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} is no file that could be replaced; name another")
+    if path.exists() and not os.access(path, os.W_OK):
+        # A rename would replace it all the same.
+        raise PermissionError(errno.EACCES, "it may not be written; allow it, or name another file", str(path))
     # Random, since processes in containers that share a folder have equal numbers, and threads of one have one.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_TEMPORARY_SUFFIX}")
     try:

@@ -5,6 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Of a progressive JPEG: each scan passes over all pixels, and takes few bytes. Ten scans are usual.
+_MAX_PASSED, _FREE_SCANS = 2_000_000_000, 100
+
 # An episode may begin in black, or with a few observations that are all the same.
 N_DARK, N_SAME, N_SAME_BATCHES = 16, 64, 16
 
@@ -73,3 +76,14 @@ def fits(value: Any, dtype: np.dtype[Any], low: Any, high: Any) -> bool:
         return False
     array = array.astype(dtype)
     return bool(((array >= low) & (array <= high)).all())
+
+
+def too_many_passes(data: bytes, width: int, height: int) -> bool:
+    """Whether a JPEG asks for far more passes over its pixels than programs write, which would take minutes.
+
+    :param data: of a file in any format
+    :param width: in pixels
+    :param height: in pixels
+    """
+    n_scans = data.count(b"\xff\xda") if data.startswith(b"\xff\xd8") else 0
+    return n_scans > _FREE_SCANS and n_scans * width * height > _MAX_PASSED

@@ -73,6 +73,8 @@ def check_action_space(space: gym.Space[Any]) -> None:
     :param space: of one environment
     :raises ValueError: unless it is ``Discrete``, ``MultiDiscrete``, ``MultiBinary`` or a bounded ``Box`` of floats
     """
+    if 0 in (space.shape or ()):
+        raise ValueError(f"actions must hold a number at least, got {space}; give the environment one to choose")
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         return
     if not isinstance(space, spaces.Box) or np.dtype(space.dtype).kind != "f":
@@ -85,6 +87,8 @@ def check_action_space(space: gym.Space[Any]) -> None:
             f"uniformly random actions need bounds, got {space}; rescale it with a wrapper "
             "(gymnasium.wrappers.RescaleAction takes a bounded one, TransformAction any)"
         )
+    if (space.low > space.high).any():
+        raise ValueError(f"actions have a lower bound above the upper one, {space}; exchange them")
 
 
 def action_layout(space: gym.Space[Any]) -> tuple[np.dtype[Any], tuple[int, ...]]:

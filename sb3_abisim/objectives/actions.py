@@ -26,6 +26,8 @@ from torch import nn
 
 from sb3_abisim.common.spaces import check_action_space
 
+# A layer of 256 inputs then has 25 million weights.
+MAX_OUTPUTS = 100_000
 _LOG_STD_RANGE = (-5.0, 2.0)
 
 
@@ -302,4 +304,9 @@ def actions_of(space: gym.Space[Any]) -> Actions:
     """
     check_action_space(space)
     actions: Actions = next(_KINDS[kind] for kind in type(space).__mro__ if kind in _KINDS)(space)
+    if actions.n_outputs > MAX_OUTPUTS:
+        raise ValueError(
+            f"{space} takes {actions.n_outputs} outputs to predict, more than {MAX_OUTPUTS}; group actions that do the "
+            "same"
+        )
     return actions

@@ -1,5 +1,6 @@
 """Archives of arrays whose headers promise more than they hold, or that are damaged."""
 
+import contextlib
 import io
 import zipfile
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from sb3_abisim.common.arrays import read_npz
+from sb3_abisim.data.readers.arrays import import_arrays
 
 
 def header(shape: tuple[int, ...], descr: str = "<f8") -> bytes:
@@ -56,3 +58,29 @@ def test_bombs_and_absent_files(tmp_path: Path) -> None:
         read_npz(bomb, names=["b"])
     with pytest.raises(FileNotFoundError):
         read_npz(tmp_path / "absent.npz")
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damage_of_every_compression_is_one_sentence(tmp_path: Path, compression: int) -> None:
+    """Each raises exceptions of its own."""
+    data = write(tmp_path / "x.npz", header((4000,)) + np.random.default_rng(0).bytes(32000), compression).read_bytes()
+    for at in (*range(30, 70), *range(70, len(data), 997)):
+        (tmp_path / "x.npz").write_bytes(data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :])
+        with contextlib.suppress(ValueError):
+            read_npz(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damaged_episodes_of_every_compression_are_one_sentence(tmp_path: Path, compression: int) -> None:
+    path = tmp_path / "x.npz"
+    frames = np.random.default_rng(0).integers(0, 255, (40, 3, 9, 9), dtype=np.uint8)
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, array in (("observations", frames), ("actions", np.zeros(39, np.int64))):
+            file = io.BytesIO()
+            np.save(file, array)
+            archive.writestr(f"{name}.npy", file.getvalue())
+    data = path.read_bytes()
+    for at in (60, 70, 90, 2000):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :])
+        with pytest.raises(ValueError, match=r"x\.npz"):
+            import_arrays(path, tmp_path / "out")

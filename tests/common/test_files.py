@@ -35,6 +35,18 @@ def test_write_replaces_the_whole_file(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["file"]
 
 
+def test_a_file_that_may_not_be_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rename would replace it all the same; to root everything is allowed, so that the system's answer is made."""
+    path, link = tmp_path / "kept", tmp_path / "link"
+    path.write_text("old")
+    link.symlink_to(path)
+    monkeypatch.setattr(os, "access", lambda name, mode: not (Path(name) == path and mode == os.W_OK))
+    for name in (path, link):
+        with pytest.raises(PermissionError, match=r"it may not be written; allow it, or name another file.*kept"):
+            write_atomic(name, lambda file: file.write(b"new"))
+    assert path.read_text() == "old" and sorted(tmp_path.iterdir()) == [path, link]
+
+
 def test_data_is_durable_before_the_name_and_the_name_before_the_return(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

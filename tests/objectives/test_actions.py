@@ -232,12 +232,21 @@ def test_objectives_that_read_no_actions_take_them(kind):
     assert isinstance(BetaVAE(LineEncoder(), SPACES[kind]).decoder, Decoder)
 
 
+def exchanged(space):
+    space.low, space.high = space.high, space.low
+    return space
+
+
 @pytest.mark.parametrize(
     ("space", "message"),
     [
         (gym.spaces.Text(3), "Discrete, MultiDiscrete, MultiBinary or a Box of floats, got Text.*TransformAction"),
         (gym.spaces.Box(0, 9, (2,), np.int64), "a Box of floats, got Box"),
         (gym.spaces.Box(-np.inf, 1, (2,), np.float32), "need bounds, got Box.*rescale it with a wrapper"),
+        (gym.spaces.Discrete(10**9), "takes 1000000000 outputs to predict, more than 100000; group"),
+        (gym.spaces.Box(0, 1, (0,), np.float32), "must hold a number at least, got Box"),
+        (gym.spaces.Box(0, 1, (2, 0), np.float32), "must hold a number at least, got Box"),
+        (exchanged(gym.spaces.Box(-1, 1, (2,), np.float32)), "a lower bound above the upper one, Box.*exchange them"),
     ],
     ids=str,
 )

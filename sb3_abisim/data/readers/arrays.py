@@ -12,6 +12,7 @@ Several episodes may follow each other in one file. Each step with a termination
 observations. Nothing is unpickled. What a header declares is compared with the file's size before anything is made.
 """
 
+import lzma
 import math
 import os
 import zipfile
@@ -232,6 +233,12 @@ class _Folder(_Part):
         return np.load(path, mmap_mode="r", allow_pickle=False)  # type: ignore[no-any-return]
 
 
+# What unpacking a member raises; what is wrong with its array has been said before.
+_UNPACKING = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, RuntimeError, EOFError, NotImplementedError,
+)  # fmt: skip
+
+
 class _Archive(_Part):
     """An .npz file.
 
@@ -272,7 +279,7 @@ class _Archive(_Part):
                     _check_header(file, member.file_size, where)
                 with archive.open(member) as file:
                     return np.lib.format.read_array(file, allow_pickle=False)
-        except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, NotImplementedError) as error:
+        except _UNPACKING as error:
             raise ValueError(f"{where} cannot be read ({error}); write it again with numpy.savez") from None
 
 

@@ -33,6 +33,8 @@ from sb3_abisim.registry import register_reader
 
 ACTION = "action"
 # Columns that number the rows, and are no state.
+# Of the columns of one table.
+MAX_TABLE_BYTES = 1 << 29
 _NUMBERING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 _VERSION = re.compile(r"v3\.\d+")
 _FIELD = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
@@ -129,7 +131,7 @@ class _Recording:
             self.features: dict[str, dict[str, Any]] = dict(info["features"])
             patterns = str(info["data_path"]), str(info.get("video_path"))
             total, shapes = int(info["total_episodes"]), {k: tuple(f["shape"]) for k, f in self.features.items()}
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{info_path} lacks what LeRobot writes there ({error!r}); download it again") from None
         if not 0 < self.fps < 1e6:
             raise ValueError(f"{info_path} says {self.fps} frames per second; correct it")
@@ -176,7 +178,7 @@ class _Recording:
         names += [f"{video}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")]
         columns = [_read_table(file, names) for file in files]
         rows = list(zip(*(np.concatenate([c[name] for c in columns]).tolist() for name in names))) if files else []  # noqa: B905
-        if sorted(row[0] for row in rows) != list(range(total)) or not total:
+        if len(rows) != total or sorted(row[0] for row in rows) != list(range(total)) or not total:
             raise ValueError(
                 f"{self.path} announces {total} episodes and describes {len(rows)} in meta/episodes; download the "
                 "whole folder"
@@ -301,6 +303,7 @@ def _read_table(path: Path, names: list[str]) -> dict[str, NDArray[Any]]:
         # An open file: a name such as http:a would be taken for an address.
         with path.open("rb") as file:
             table = pyarrow.parquet.ParquetFile(file)
+            _check_size(table.metadata, names)
             missing = [name for name in names if name not in table.schema_arrow.names]
             if missing:
                 raise ValueError(f"there is no column {missing[0]!r}")
@@ -308,6 +311,17 @@ def _read_table(path: Path, names: list[str]) -> dict[str, NDArray[Any]]:
             return {name: _to_numpy(pyarrow, name, table.read(columns=[name]).column(name)) for name in names}
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise ValueError(f"{path} cannot be read as LeRobot writes it ({error}); download it again") from None
+
+
+def _check_size(metadata: Any, names: list[str]) -> None:
+    """Before they are unpacked: equal values take no room in a file."""
+    groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
+    columns = [group.column(k) for group in groups for k in range(group.num_columns)]
+    # Those of lists lie below their names.
+    wanted = [c for c in columns if any(f"{c.path_in_schema}.".startswith(f"{name}.") for name in names)]
+    n_bytes = 8 * sum(max(column.num_values, 0) for column in wanted)
+    if n_bytes > MAX_TABLE_BYTES:
+        raise ValueError(f"its columns declare {n_bytes} bytes, more than {MAX_TABLE_BYTES}")
 
 
 def _to_numpy(pyarrow: Any, name: str, column: Any) -> NDArray[Any]:

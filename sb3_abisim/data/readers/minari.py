@@ -8,13 +8,17 @@ of the environment then comes from the blocks of the combined datasets, where th
 ``env_spec`` that an export writes where the id is registered.
 """
 
+import contextlib
 import copy
+import functools
 import hashlib
 import json
 import os
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -46,6 +50,8 @@ from sb3_abisim.registry import register_reader
 
 # The key of our block in a Minari dataset's metadata.
 METADATA_KEY = "sb3_abisim"
+# What an array of HDF5 may unpack to: this, and more by the bytes that it takes. Deflate packs zeros a thousandfold.
+MAX_UNPACKED_BYTES, UNPACKED_PER_BYTE = 1 << 20, 1100
 # Infos of an exported episode: true on the last row of a segment that ended because its shard did.
 CUT_KEY = "cut_by_shard_end"
 FACTORS_KEY = "factors"
@@ -142,7 +148,7 @@ def import_dataset(
     storage, metadata = _open_storage(dataset_id)
     layout = recorded_layout(storage.observation_space, image_key, f"Minari dataset {dataset_id}")
     identity = _identity(dataset_id, storage, metadata, layout, env_id)
-    episodes = storage.get_episodes(range(storage.total_episodes))
+    episodes = _episodes(storage, dataset_id)
     segments = (_segment(episode, identity, layout) for episode in episodes)
     return write_segments(folder, _verified(segments, dataset_id, metadata), identity)
 
@@ -218,12 +224,65 @@ def _open_storage(dataset_id: str) -> tuple[Any, dict[str, Any]]:
     path = get_dataset_path(dataset_id) / "data"
     if not path.is_dir():
         raise ValueError(f"no Minari dataset {dataset_id!r} at {path}; fetch it first: minari download {dataset_id}")
+    for file in path.rglob("*.hdf5"):
+        _check_hdf5(file)
     metadata = MinariStorage.read_raw_metadata(path)
     # Where a space is missing, Minari would make the environment to ask it, and with it run what the file names.
     for key in ("observation_space", "action_space"):
         if not isinstance(metadata.get(key), str):
             raise ValueError(f"Minari dataset {dataset_id} does not record its {key}; datasets of Minari 0.5 do")
     return MinariStorage.read(path), metadata
+
+
+def _episodes(storage: Any, where: str) -> Iterator[dict[str, Any]]:
+    """What Minari reads; whatever it raises for a damaged file is one sentence."""
+    try:
+        with _jpeg_alone(storage):
+            yield from storage.get_episodes(range(storage.total_episodes))
+    except Exception as error:
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise ValueError(f"Minari dataset {where} cannot be read ({reason}); fetch it again") from error
+
+
+@contextlib.contextmanager
+def _jpeg_alone(storage: Any) -> Iterator[None]:
+    """Minari lets Pillow guess what its images are, and Pillow starts Ghostscript for some."""
+    module: Any = sys.modules[type(storage).__module__]
+    pillow = module.Image
+    jpeg = SimpleNamespace(open=functools.partial(pillow.open, formats=("JPEG",)), fromarray=pillow.fromarray)
+    module.Image = jpeg
+    try:
+        yield
+    finally:
+        module.Image = pillow
+
+
+def _check_hdf5(path: Path) -> None:
+    """Refuse what leads to other files, and arrays that unpack to far more than they take, before they are read.
+
+    :param path: of a file of HDF5
+    :raises ValueError: naming it
+    """
+    import h5py
+
+    def check(name: str, group: Any) -> None:
+        for key in group:
+            where, link = f"{name}/{key}", group.get(key, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                raise ValueError(f"{where} is a link")
+            entry = group[key]
+            if isinstance(entry, h5py.Group):
+                check(where, entry)
+            elif entry.is_virtual or entry.external:
+                raise ValueError(f"{where} lies in another file")
+            elif entry.nbytes > MAX_UNPACKED_BYTES + UNPACKED_PER_BYTE * entry.id.get_storage_size():
+                raise ValueError(f"{where} declares {entry.nbytes} bytes in {entry.id.get_storage_size()}")
+
+    try:
+        with h5py.File(path, "r") as file:
+            check("", file)
+    except (OSError, RuntimeError, KeyError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged or no file of Minari's ({error}); fetch it again") from error
 
 
 def _identity(
@@ -322,7 +381,7 @@ def _factors_of_episodes(storage: Any) -> tuple[dict[str, Any], list[str]]:
     Whoever combined datasets kept them, but not what announced them.
     """
     layouts = []
-    for episode in storage.get_episodes(range(storage.total_episodes)):
+    for episode in _episodes(storage, str(storage.data_path)):
         rows = (episode["infos"] or {}).get(FACTORS_KEY)
         n = len(episode["terminations"]) + 1
         rows = rows if isinstance(rows, dict) else {}

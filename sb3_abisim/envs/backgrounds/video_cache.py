@@ -27,7 +27,7 @@ from sb3_abisim.envs.backgrounds.video_whole import ClipError
 
 _BYTES_PER_FRAME = 3 * SIZE * SIZE
 # Raise it when the decoding changes, so that older cache entries are not used.
-_CACHE_VERSION = 2
+_CACHE_VERSION = 3
 
 
 def _make_cache(folder: Path) -> None:

@@ -9,7 +9,6 @@ import contextlib
 import gc
 import importlib
 import itertools
-import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,8 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.images import too_many_passes
 from sb3_abisim.envs.backgrounds.clips import SIZE
 from sb3_abisim.envs.backgrounds.video_files import Source
+from sb3_abisim.envs.backgrounds.video_roles import NUMBERED
 from sb3_abisim.envs.backgrounds.video_whole import ClipError, require_whole
 
 if TYPE_CHECKING:
@@ -39,6 +40,14 @@ _OPTIONS = {
     # Larger ones are left without a size, before memory is taken for them.
     "max_pixels": str(MAX_FRAME_PIXELS),
 }
+# What is behind a transparent part is not known, and its own color is not meant to be seen.
+_TRANSPARENT = "{path} is transparent in parts; lay it over a color, or remove it"
+OPAQUE = 255
+# Transfer functions of HDR: SMPTE 2084 (PQ) and ARIB STD-B67 (HLG).
+_HDR = (16, 18)
+# Pillow's formats of frames, whatever their suffix says, and its modes of 8 bits per channel whose colors are read.
+_FORMATS = ("BMP", "JPEG", "PNG", "WEBP")
+_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "YCbCr")
 # From the display matrix, of which a row says where an axis goes, to Pillow's transposition.
 _TRANSPOSITIONS = {
     (1, 0, 0, 1): None,
@@ -121,9 +130,17 @@ def decode_video(path: Path) -> Iterator[tuple["Image.Image", float]]:
 
 def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", float]:
     """A frame as it is shown, and the aspect of its pixels then."""
+    side_data = {data.type.name: data for data in frame.side_data}
+    if int(frame.color_trc) in _HDR:
+        raise ClipError(
+            f"{path} is in HDR, whose colors are not read; convert it: ffmpeg -i {path.name} -vf "
+            "zscale=t=linear:npl=100,tonemap=hable,zscale=t=bt709:m=bt709:r=tv,format=yuv420p sdr.mp4"
+        )
+    if "SPHERICAL" in side_data or ("STEREO3D" in side_data and any(bytes(side_data["STEREO3D"])[:4])):
+        raise ClipError(f"{path} holds two images or a sphere in each frame; take one view out of it, or remove it")
     # Its own to_image keeps more of them in memory.
-    image = importlib.import_module("PIL.Image").fromarray(frame.to_ndarray(format="rgb24"))
-    matrix = next((data for data in frame.side_data if data.type.name == "DISPLAYMATRIX"), None)
+    image = importlib.import_module("PIL.Image").fromarray(_opaque(frame, path))
+    matrix = side_data.get("DISPLAYMATRIX")
     if matrix is None:
         return image, aspect
     # Fixed-point numbers: x to (a, b), y to (c, d).
@@ -139,12 +156,29 @@ def _upright(frame: Any, aspect: float, path: Path) -> tuple["Image.Image", floa
     return turned, aspect if rows[0] else 1 / aspect
 
 
+def _opaque(frame: Any, path: Path) -> NDArray[np.uint8]:
+    """The colors of a frame, which hides nothing."""
+    if not (frame.format.has_palette or any(component.is_alpha for component in frame.format.components)):
+        return np.asarray(frame.to_ndarray(format="rgb24"))
+    pixels = frame.to_ndarray(format="rgba")
+    if pixels[..., 3].min() < OPAQUE:
+        raise ClipError(_TRANSPARENT.format(path=path))
+    return np.ascontiguousarray(pixels[..., :3])
+
+
 def _video_stream(container: Any, path: Path) -> Any:
     """The video, which is no cover image."""
     cover = importlib.import_module("av.stream").Disposition.attached_pic
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
         raise ClipError(f"{path} holds no video{' but a cover' * bool(container.streams.video)}; remove it")
+    if len(streams) > 1:
+        raise ClipError(
+            f"{path} holds {len(streams)} videos, and which is meant is not known; take one: "
+            f"ffmpeg -i {path.name} -map 0:v:0 -c copy one{path.suffix}"
+        )
+    if streams[0].metadata.get("alpha_mode") == "1":
+        raise ClipError(_TRANSPARENT.format(path=path))
     # A stream that no decoder is known for has no size at all.
     if not (getattr(streams[0], "width", 0) and getattr(streams[0], "height", 0)):
         raise ClipError(
@@ -216,33 +250,61 @@ def _decode_images(source: Source) -> Iterator["Image.Image"]:
     image_module = importlib.import_module("PIL.Image")
     ops = importlib.import_module("PIL.ImageOps")
     _check_numbers(source)
+    size = None
     for file in source.files:
-        try:
-            with image_module.open(file) as image:
-                _require_size(image, file)
-                if image.mode.startswith(("I", "F")):
-                    raise ClipError(
-                        f"{file} has more than 8 bits per value ({image.mode}); convert {source.path} to 8 bits"
-                    )
-                if getattr(image, "n_frames", 1) > 1:
-                    raise ClipError(f"{file} holds several frames; make it a video, or remove {source.path}")
-                yield ops.exif_transpose(image).convert("RGB")
-        except (OSError, SyntaxError, image_module.DecompressionBombError) as error:
-            raise ClipError(f"{file} cannot be decoded ({error}); replace the file or remove {source.path}") from error
+        with _decoding(file, source.path), image_module.open(file, formats=_FORMATS) as image:
+            _require_size(image, file)
+            if too_many_passes(file.read_bytes(), *image.size):
+                raise ClipError(f"{file} has more scans than programs write; save it again, or remove {source.path}")
+            if image.mode.startswith(("I", "F")):
+                raise ClipError(
+                    f"{file} has more than 8 bits per value ({image.mode}); convert {source.path} to 8 bits"
+                )
+            if image.mode not in _MODES:
+                raise ClipError(
+                    f"{file} has colors of the kind {image.mode}, which are not read; convert {source.path} to RGB"
+                )
+            if getattr(image, "n_frames", 1) > 1:
+                raise ClipError(f"{file} holds several frames; make it a video, or remove {source.path}")
+            shown = _flat(ops.exif_transpose(image), file)
+        if size not in (None, shown.size):
+            raise ClipError(
+                f"{file} has {shown.width} x {shown.height} pixels, and frames before it have others; are these "
+                f"photographs? Give {source.path} frames of one size, or remove it"
+            )
+        size = shown.size
+        yield shown
 
 
 def _decode_webp(path: Path) -> Iterator["Image.Image"]:
     """The images of an animated WebP."""
     image_module = importlib.import_module("PIL.Image")
     require_whole(path)
+    with _decoding(path, path), image_module.open(path, formats=("WEBP",)) as image:
+        _require_size(image, path)
+        for index in range(image.n_frames):
+            image.seek(index)
+            yield _flat(image, path)
+
+
+@contextlib.contextmanager
+def _decoding(file: Path, clip: Path) -> Iterator[None]:
+    """Whatever Pillow raises, which depends on where the damage is, as one sentence."""
     try:
-        with image_module.open(path) as image:
-            _require_size(image, path)
-            for index in range(image.n_frames):
-                image.seek(index)
-                yield image.convert("RGB")
-    except (OSError, EOFError, SyntaxError, image_module.DecompressionBombError) as error:
-        raise ClipError(f"{path} cannot be decoded ({error}); replace the file or remove it") from error
+        yield
+    except ClipError:
+        raise
+    except Exception as error:
+        raise ClipError(f"{file} cannot be decoded ({error}); replace the file or remove {clip}") from error
+
+
+def _flat(image: "Image.Image", path: Path) -> "Image.Image":
+    """An image in RGB, which hides nothing."""
+    if "A" in image.getbands() or "transparency" in image.info:
+        clearest: Any = image.convert("RGBA").getchannel("A").getextrema()[0]
+        if clearest < OPAQUE:
+            raise ClipError(_TRANSPARENT.format(path=path))
+    return image.convert("RGB")
 
 
 def _require_size(image: "Image.Image", file: Path) -> None:
@@ -254,8 +316,8 @@ def _require_size(image: "Image.Image", file: Path) -> None:
 
 def _check_numbers(source: Source) -> None:
     """Frames numbered 0, 5, 10 are complete, frames 0, 1, 3 are not."""
-    matches = [re.fullmatch("(.*?)([0-9]+)", file.stem) for file in source.files]
-    if len(matches) < 3 or len({match and match[1] for match in matches}) > 1 or matches[0] is None:
+    matches = [NUMBERED.fullmatch(file.stem) for file in source.files]
+    if len(matches) < 3 or len({match and (match[1], match[3]) for match in matches}) > 1 or matches[0] is None:
         return
     numbers = [int(match[2]) for match in matches if match]
     steps = [b - a for a, b in itertools.pairwise(numbers)]

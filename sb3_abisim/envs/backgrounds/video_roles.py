@@ -28,6 +28,12 @@ OTHER_ROLES = frozenset(
         "segmentations",
         "segmask",
         "segmasks",
+        "semseg",
+        "insseg",
+        "trimap",
+        "trimaps",
+        "silhouette",
+        "silhouettes",
         "label",
         "labels",
         "gt",
@@ -54,11 +60,23 @@ OTHER_ROLES = frozenset(
         "albedo",
     )
 )
+# Of these, what may be a clip's name as well, such as alpha_2.
+_DOUBTFUL = frozenset(
+    ("alpha", "flow", "flows", "normal", "normals", "gt", "instance", "instances", "label", "labels", "matte", "disp")
+)
+# Words beside a role's: how it is stored, shown or made.
+_FORMS = frozenset(
+    (
+        "png", "jpg", "jpeg", "exr", "npy", "raw", "bit", "bits", "vis", "viz", "color", "colored", "map",
+        "maps", "image", "images", "img", "imgs", "frames", "v", "pred", "preds", "predicted", "class", "object",
+        "id", "ids", "fine", "coarse", "left", "right", "hd", "full", "trainids", "sem",
+    )
+)  # fmt: skip
 # Folders of which the name says that images lie there, not of which clip.
 CONTAINER_FOLDERS = frozenset(("jpegimages", "480p", "1080p", "full-resolution", "rgb", "images", "frames", "color"))
 # A mask or a code has no more colors than this.
 _MAX_COLORS = 16
-_NUMBERED = re.compile(r"(.*?)([0-9]+)([^0-9]*)")
+NUMBERED = re.compile(r"(.*?)([0-9]+)([^0-9]*)")
 
 
 class _Clip(Protocol):
@@ -74,37 +92,65 @@ def is_other_role(name: str, siblings: Collection[str], alone: bool = True) -> b
     """Whether a name says that something is masks, depth or the like.
 
     :param name: of a folder, or of a file without its suffix
-    :param siblings: the names beside it; ``bear_mask`` is taken for the masks of ``bear`` where that is there
-    :param alone: whether a word such as ``masks`` alone says so
+    :param siblings: the names beside it; ``bear_mask`` is taken for the masks of ``bear`` where that is there, and
+        ``alpha_png`` for a role beside ``rgb``
+    :param alone: whether a word such as ``masks`` alone says so; else it does beside ``rgb``
     """
-    words = [word for word in re.split(r"[\s_.-]+", name.lower()) if word]
-    if alone and words and ("".join(words) in OTHER_ROLES or words[0] == "annotations"):
-        return True
-    others = {sibling.lower() for sibling in siblings}
-    match = re.fullmatch(r"(.+)[\s_.-]+([a-z]+)", name.lower())
-    return match is not None and match[2] in OTHER_ROLES and match[1] in others
+    words, others = _words(name), [sibling for sibling in siblings if sibling != name]
+    if role := _role(words):
+        if any(map(_is_color, others)):
+            return True
+        if alone and ("".join(words) in OTHER_ROLES or role not in _DOUBTFUL):
+            return True
+    beside = {"".join(_words(sibling)) for sibling in others}
+    halves = [half for k in range(1, len(words)) for half in ((words[k:], words[:k]), (words[:k], words[k:]))]
+    return any(_role(one) and "".join(other) in beside for one, other in halves)
 
 
-def require_one_series(folder: Path, images: Iterable[Path]) -> None:
-    """Refuse a folder whose images are the frames of several clips, or frames and their masks.
+def _words(name: str) -> list[str]:
+    """Of a name such as ``DepthMaps_16bit``, in small letters, and its numbers."""
+    return [part.lower() for part in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+|[^\W\d_A-Za-z]+", name)]
+
+
+def _role(words: list[str]) -> str:
+    """The role that all words speak of, but for those of its form; empty for none."""
+    if words[:1] == ["annotations"]:
+        return words[0]
+    bare = [word for word in words if word not in _FORMS and not word.isdigit()]
+    is_role = "".join(bare) in OTHER_ROLES or (bare and all(word in OTHER_ROLES for word in bare))
+    return "".join(bare) if is_role else ""
+
+
+def _is_color(name: str) -> bool:
+    return name.lower() in CONTAINER_FOLDERS or "".join(_words(name)) in ("image", "video")
+
+
+def require_one_series(folder: Path, images: Collection[Path]) -> None:
+    """Refuse a folder whose images are the frames of several clips, frames and their masks, or photographs.
 
     :param folder: of the images
     :param images: in it
-    :raises ValueError: if frames of one number have several names
+    :raises ValueError: if frames of one number have several names, or if names differ by more than numbers
     """
-    series: dict[tuple[str, str], set[int]] = defaultdict(set)
+    series: dict[tuple[str, str], list[int]] = defaultdict(list)
     for image in images:
-        if match := _NUMBERED.fullmatch(image.stem):
-            series[match[1], match[3] + image.suffix.lower()].add(int(match[2]))
+        if match := NUMBERED.fullmatch(image.stem):
+            series[match[1], match[3] + image.suffix.lower()].append(int(match[2]))
     kinds = sorted(series, key=lambda kind: -len(series[kind]))
-    for i, one in enumerate(kinds):
-        for other in kinds[i + 1 :]:
-            if len(series[one] & series[other]) > 1:
-                names = " and ".join(f"{before}N{behind}" for before, behind in (one, other))
-                raise ValueError(
-                    f"{folder} holds several images of one number, {names}: frames of two clips, or their masks? Put "
-                    "the frames of each clip into a folder of their own"
-                )
+    pairs = [(one, other) for i, one in enumerate(kinds) for other in kinds[i + 1 :]]
+    twice = [(kind, kind) for kind in kinds if len(set(series[kind])) < len(series[kind])]
+    for one, other in twice + [pair for pair in pairs if len(set(series[pair[0]]) & set(series[pair[1]])) > 1]:
+        names = " and ".join(f"{before}N{behind}" for before, behind in (one, other))
+        raise ValueError(
+            f"{folder} holds several images of one number, {names}: frames of two clips, or their masks? Put "
+            "the frames of each clip into a folder of their own"
+        )
+    patterns = sorted({re.sub("[0-9]+", "N", image.stem) for image in images})
+    if len(images) > 1 and (len(patterns) > 1 or "N" not in patterns[0]):
+        raise ValueError(
+            f"{folder} holds images whose names are no numbers of one series ({', '.join(patterns[:3])}): photographs, "
+            "or frames of several clips? Number the frames of each clip in a folder of their own"
+        )
 
 
 def require_images(sources: Iterable[_Clip]) -> None:
@@ -139,7 +185,7 @@ def _kind(file: Path) -> str | None:
     from PIL import Image
 
     try:
-        with Image.open(file) as image:
+        with Image.open(file, formats=("BMP", "JPEG", "PNG", "WEBP")) as image:
             if image.mode.startswith(("I", "F")):
                 return None  # decoding refuses these
             image.draft("RGB", (256, 256))
@@ -148,7 +194,7 @@ def _kind(file: Path) -> str | None:
                 is_gray = image.mode in ("1", "L", "LA")
                 return "codes" if few else "gray" if is_gray else "color"
             return "few colors" if few else "color"
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+    except Exception:  # what Pillow raises depends on where the damage is
         return None  # decoding will say so
 
 

@@ -19,8 +19,9 @@ MAX_IMAGE_SIDE = 8192
 MAX_IMAGE_PIXELS = 512_000_000  # of all textures together
 # A few bytes can declare an image of any size; these many pixels are granted in any case, and then so many per byte.
 FREE_IMAGE_PIXELS = 68_000_000
-IMAGE_PIXELS_PER_BYTE = 50
-_MAX_STEPS = 32  # folders of a path that are looked for
+IMAGE_PIXELS_PER_BYTE = 20
+_MAX_STEPS = 16  # folders of a path that are looked for
+_MAX_MISSING = 2000  # files that are looked for everywhere
 
 
 class SceneError(ValueError):
@@ -132,6 +133,8 @@ class ScanFiles:
         for candidate in dict.fromkeys(looked_for):
             if (found := self._there(candidate)) is not None:
                 return found
+        if len(self.missing) >= _MAX_MISSING:
+            raise SceneError(f"{self.path} refers to over {_MAX_MISSING} files that are not there; export it again")
         # Wherever it appears, it is noticed.
         self.hashes.update(dict.fromkeys((each for each in looked_for if len(each) < 1000), ""))
         self.missing.append(name)

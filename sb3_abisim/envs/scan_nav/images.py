@@ -1,5 +1,6 @@
 """Textures of scans: decoded to colors and alpha, once each, after their declared sizes have been counted."""
 
+import hashlib
 import io
 import warnings
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.images import too_many_passes
 from sb3_abisim.envs.scan_nav.files import REEXPORT, Budget, ScanFiles, SceneError
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA")
@@ -26,6 +28,7 @@ class Images:
     def __init__(self, files: ScanFiles, budget: Budget) -> None:
         self._files, self._budget = files, budget
         self._known: dict[str, Image] = {}
+        self._seen: frozenset[bytes] = frozenset()
         self._shaded: dict[tuple[str, tuple[float, ...]], NDArray[np.uint8]] = {}
 
     @property
@@ -64,12 +67,19 @@ class Images:
             if (factor == 255).all():
                 self._shaded[key] = rgb
             else:
+                self._budget.add_image(f"{name} in another shade", rgb.shape[1], rgb.shape[0], 0)
                 shaded = np.empty_like(rgb)
                 for row in range(0, len(rgb), 256):  # in strips, since floats take four times the memory
                     strip = rgb[row : row + 256].astype(np.float32) * (factor / 255)
                     shaded[row : row + 256] = np.rint(strip).astype(np.uint8)
                 self._shaded[key] = shaded
         return self._shaded[key]
+
+    def _new_bytes(self, data: bytes) -> int:
+        """Of a file: the same bytes grant no more pixels under another name."""
+        digest = hashlib.sha256(data).digest()
+        known, self._seen = digest in self._seen, self._seen | {digest}
+        return 0 if known else len(data)
 
     def _decode(self, data: bytes, name: str) -> Image:
         from PIL import Image as Pillow
@@ -81,7 +91,9 @@ class Images:
                 image = Pillow.open(io.BytesIO(data), formats=_FORMATS)
         except Exception as error:  # what Pillow raises depends on where the damage is
             raise SceneError(unreadable) from error
-        self._budget.add_image(name, *image.size, len(data))
+        self._budget.add_image(name, *image.size, self._new_bytes(data))
+        if too_many_passes(data, *image.size):
+            raise SceneError(unreadable)
         if image.mode not in _MODES:
             raise SceneError(
                 f"{self._files.path}: the texture {name} has colors of the kind {image.mode}, which are not read; "

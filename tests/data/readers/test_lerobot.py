@@ -23,6 +23,7 @@ from lerobot_inputs import (
     make_episodes,
     make_info,
     make_rows,
+    pa,
     shade,
     write_lerobot,
     write_table,
@@ -329,3 +330,21 @@ def test_a_list_of_files_in_place_of_a_video_is_refused(source: Path, tmp_path: 
         path.write_text(f"ffconcat version 1.0\nfile {other.name}\n")
     with pytest.raises(ValueError, match=r"file-000\.mp4 cannot be decoded"):
         read(source, tmp_path / "a")
+
+
+def test_columns_that_declare_more_than_they_take_are_refused(source: Path, tmp_path: Path) -> None:
+    """Equal values take no room in Parquet."""
+    path = source / DATA_PATH.format(chunk_index=0, file_index=0)
+    zeros = pa.array(np.zeros(12_000_000, np.int8)).dictionary_encode()
+    names = ["episode_index", "frame_index", "timestamp", "action", "observation.state", "observation.gripper"]
+    pa.parquet.write_table(pa.table(dict.fromkeys(names, zeros)), path)
+    assert path.stat().st_size < 1_000_000
+    with pytest.raises(ValueError, match=r"its columns declare 576000000 bytes, more than 536870912"):
+        read(source, tmp_path / "out")
+
+
+@pytest.mark.parametrize("total", [10**12, float("inf"), -1])
+def test_any_number_of_episodes_takes_no_memory(source: Path, tmp_path: Path, total: float) -> None:
+    (source / "meta" / "info.json").write_text(json.dumps(make_info(total_episodes=total)))
+    with pytest.raises(ValueError, match=r"announces -?\d+ episodes and describes 3|lacks what LeRobot writes there"):
+        read(source, tmp_path / "out")

@@ -54,7 +54,7 @@ class TestDecoding:
                 assert np.abs(frames[:, :, 32, 2] - expected[:, None]).max() <= 12  # the black margin is cut off
 
     def test_frames_in_natural_order_averaged_to_64(self, folder):
-        two_folders(folder)
+        write_frames(folder / "a", 1), write_frames(folder / "b", 2, size=(192, 128))
         Image.fromarray(np.arange(128 * 192 * 3, dtype=np.uint8).reshape(128, 192, 3)).save(folder / "b" / "frame5.png")
         clips = {name: (side, i) for side in both(folder) for i, name in enumerate(side.names)}
         assert sorted(clips) == ["a", "b"]

@@ -123,6 +123,24 @@ def test_words():
     assert not any(is_other_role(name, ()) for name in ("masked_singer", "depths_of_wikipedia", "bear", "bear_mask"))
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "depth_png", "masks_v2", "SegmentationClass", "gtFine", "labelIds", "flow_vis", "normal_maps", "sem_seg",
+        "Mask0", "DepthMaps_16bit", "optical-flow-png", "pred_masks", "trimaps", "alpha_1",
+    ],
+)  # fmt: skip
+def test_roles_with_words_about_their_form(name):
+    assert is_other_role(name, ("rgb", name)) and is_other_role(name, ("video", name), alone=False)
+
+
+def test_a_doubtful_word_is_a_role_beside_color_or_its_clip_alone():
+    assert not any(is_other_role(name, (name, "walk")) for name in ("alpha_1", "normal_02", "flow-left"))
+    assert is_other_role("depth_png", ("depth_png", "walk"))
+    assert all(is_other_role(name, (name, "walk_1")) for name in ("walk_1_alpha", "mask_walk_1", "walk1-sem-seg-png"))
+    assert not any(is_other_role(name, (name, "rgb")) for name in ("rgb", "walk", "images", "left", "1", "right_color"))
+
+
 def test_kinds_that_are_not_read_are_named(folder):
     for name in ("a.mp4", "b.mp4", "c.wmv", "d.TS", "e.flv", "f.3gp", "x/g.heic", "notes.txt", "README"):
         (folder / name).parent.mkdir(exist_ok=True)

@@ -103,6 +103,48 @@ def test_images_together_are_bounded_by_the_bytes_that_hold_them(tmp_path, monke
         load_mesh(path)
 
 
+def test_images_that_share_their_bytes_are_granted_pixels_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "FREE_IMAGE_PIXELS", 0)
+    gltf = Gltf()
+    view = gltf.view(data := bomb(600))
+    for _ in range(2):
+        image = gltf.add("images", bufferView=view, mimeType="image/png")
+        texture = {"index": gltf.add("textures", source=image)}
+        gltf.node(gltf.primitive(FLOOR, {"pbrMetallicRoughness": {"baseColorTexture": texture}}, uv=UV))
+    monkeypatch.setattr(files, "IMAGE_PIXELS_PER_BYTE", 360_000 // len(data) + 1)
+    with pytest.raises(SceneError, match=rf"its textures declare 720000 pixels in {len(data)} bytes"):
+        load_mesh(gltf.save(tmp_path / "shared.glb"))
+
+
+def test_a_texture_in_many_shades_is_counted_in_each(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "FREE_IMAGE_PIXELS", 2_000_000)
+    monkeypatch.setattr(files, "IMAGE_PIXELS_PER_BYTE", 0)
+    gltf = with_image(bomb(600))
+    for k in range(5):
+        rough = {"baseColorFactor": [0.1 * k, 1, 1, 1], "baseColorTexture": {"index": 0}}
+        gltf.node(gltf.primitive(FLOOR, {"pbrMetallicRoughness": rough}, uv=UV))
+    with pytest.raises(SceneError, match="its textures declare 2160000 pixels"):
+        load_mesh(gltf.save(tmp_path / "shades.glb"))
+
+
+def test_a_jpeg_of_countless_scans_is_not_decoded(tmp_path):
+    file = io.BytesIO()
+    Image.new("L", (3000, 3000)).save(file, "JPEG", progressive=True)
+    data = file.getvalue()
+    last = data.rindex(b"\xff\xda")
+    load_mesh(with_image(data).save(tmp_path / "few.glb"))
+    path = with_image(data[:-2] + data[last:-2] * 300 + data[-2:]).save(tmp_path / "scans.glb")
+    with pytest.raises(SceneError, match=r"the texture image 0 cannot be decoded"):
+        load_mesh(path)
+
+
+def test_files_that_are_looked_for_are_bounded(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_MAX_MISSING", 3)
+    (tmp_path / "a.obj").write_text("mtllib 1 2 3 4 5\nv 0 0 0\nv 4 0 0\nv 0 4 0\nf 1 2 3\n")
+    with pytest.raises(SceneError, match="refers to over 3 files that are not there"):
+        load_mesh(tmp_path / "a.obj")
+
+
 def test_faces_are_counted_before_they_are_copied(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MAX_FACES", 7)
     gltf = Gltf()
