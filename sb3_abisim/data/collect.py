@@ -248,7 +248,10 @@ def _command(args: argparse.Namespace) -> None:
     known = args.entry_fn is not None and args.env in gym.registry
     entry = args.entry_fn(args.env, args.conf_file) if known else {}
     env_kwargs = {**(entry.get("env_kwargs") or {}), **parse_pairs(args.env_kwargs, "--env-kwargs")}
-    wrappers, policy = [parse_value(text) for text in args.env_wrapper], None
+    # A list as -params of train takes it, too.
+    given = [parse_value(text) for text in args.env_wrapper]
+    wrappers = [wrapper for one in given for wrapper in (one if isinstance(one, list) else [one])]
+    policy = None
     if args.policy_fn is not None and args.policy != "random":
         policy = args.policy_fn(args.policy, args.epsilon, args.trust)
     try:

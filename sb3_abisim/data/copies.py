@@ -30,6 +30,10 @@ _WRAPPERS = (
     "a wrapper makes images: --env-wrapper gymnasium.wrappers.AddRenderObservation --env-kwargs render_mode:rgb_array "
     "shows what the environment renders"
 )
+_FLOATS = (
+    'two wrappers make bytes of these floats: --env-wrapper "gymnasium.wrappers.RescaleObservation: {min_obs: 0, '
+    'max_obs: 255}" "gymnasium.wrappers.DtypeObservation: {dtype: uint8}"'
+)
 # Where the channels of an observation are: (C, H, W), (H, W, C) or (H, W).
 FIRST, LAST, NONE = "first", "last", "none"
 
@@ -90,6 +94,8 @@ class ImageLayout:
         elif image_key is not None:
             raise ValueError(f"image_key {image_key!r} chooses from a Dict of observations, got {space}; leave it out")
         if not _is_image(space):
+            if remedy == _WRAPPERS and _is_float_image(space):
+                remedy = _FLOATS
             raise ValueError(
                 "observations must be uint8 images in 0..255 of shape (channels, height, width), (height, width, "
                 f"channels) or (height, width), got {space}; {remedy}"
@@ -212,6 +218,10 @@ def factor_name(key: str) -> str:
     :param key: such as "observation.state"
     """
     return re.sub(r"\W|^(?=\d)", "_", key, flags=re.ASCII)
+
+
+def _is_float_image(space: gym.Space[Any]) -> bool:
+    return isinstance(space, spaces.Box) and space.dtype.kind == "f" and len(space.shape) == 3 and space.is_bounded()
 
 
 def _is_image(space: gym.Space[Any]) -> bool:

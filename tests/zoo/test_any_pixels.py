@@ -27,9 +27,9 @@ class OddEnv(gym.Env[Any, Any]):
 
     def __init__(
         self, shape: tuple[int, ...] = (40, 56, 3), actions: str = "discrete", vector: bool = False, text: bool = False,
-        render_mode: str | None = None,
+        floats: bool = False, render_mode: str | None = None,
     ) -> None:  # fmt: skip
-        image = spaces.Box(0, 255, tuple(shape), np.uint8)
+        image = spaces.Box(0, 1, tuple(shape), np.float32) if floats else spaces.Box(0, 255, tuple(shape), np.uint8)
         parts: dict[str, Any] = {"eye": image, "arm": spaces.Box(-1, 1, (3,)), "door": spaces.Discrete(2)}
         parts |= {"words": spaces.Text(4)} if text else {}
         self.observation_space = spaces.Dict(parts) if vector or text else image
@@ -71,6 +71,14 @@ CASES: dict[str, tuple[list[str], list[str], str]] = {
         ["shape:[16, 12, 3]", "vector:true", "actions:box"],
         ["frame_stack:2", "env_wrapper:{gymnasium.wrappers.FilterObservation: {filter_keys: [eye, arm]}}"],
         "sac",
+    ),
+    "floats": (
+        ["shape:[12, 16, 3]", "floats:true"],
+        [
+            "env_wrapper:[{gymnasium.wrappers.RescaleObservation: {min_obs: 0, max_obs: 255}}, "
+            "{gymnasium.wrappers.DtypeObservation: {dtype: uint8}}]"
+        ],
+        "ppo",
     ),
     "wrapped": (
         ["shape:[64, 64, 3]"],
@@ -131,6 +139,7 @@ def test_frozen(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         (["shape:[16, 12, 3]", "vector:true"], ["frame_stack:2"], 2, "door (Discrete) cannot be stacked; keep"),
         (["shape:[40, 48]"], [], 2, "ReshapeObservation: {shape: [40, 48, 1]}"),
         (["actions:start"], [], 2, "counts actions from 0, and these do not: Discrete(3, start=2)"),
+        (["shape:[12, 16, 3]", "floats:true"], [], 0, 'RescaleObservation: {min_obs: 0, max_obs: 255}" "gymnasium'),
         (["shape:[2, 3, 4, 5]"], [], 0, "observations must be uint8 images"),
     ],
 )  # fmt: skip
