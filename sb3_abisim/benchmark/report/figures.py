@@ -84,7 +84,9 @@ def plot(comparison: Comparison) -> dict[str, bytes]:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    colors = _colors(comparison)
+    labels = list(dict.fromkeys(label for groups in comparison.groups.values() for label in groups))
+    labels.sort(key=lambda label: label != comparison.reference)
+    colors = assign_colors(labels)
     images = {}
     functions = {
         "curves": _curves, "thresholds": _thresholds, "splits": _splits, "aggregates": _aggregates,
@@ -110,16 +112,8 @@ def plot_curves(comparison: Comparison, names: Mapping[str, str]) -> bytes:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    colors = _colors(comparison)
     with plt.rc_context(_STYLE):
-        return _png(_curves(comparison, {label: colors[label] for label in names}, names))
-
-
-def _colors(comparison: Comparison) -> dict[str, str]:
-    """Each label's color, the reference first."""
-    labels = list(dict.fromkeys(label for groups in comparison.groups.values() for label in groups))
-    labels.sort(key=lambda label: label != comparison.reference)
-    return assign_colors(labels)
+        return _png(_curves(comparison, assign_colors(list(names)), names))
 
 
 def _png(figure: "Figure") -> bytes:
