@@ -59,6 +59,7 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_envs
 	$(BIN)/python -m benchmarks.bench_pretraining
 	$(BIN)/python -m benchmarks.bench_memory
+	$(BIN)/python -m benchmarks.bench_scale
 	$(BIN)/python -m benchmarks.bench_frozen
 	$(BIN)/python -m benchmarks.bench_auxiliary
 	$(BIN)/python -m benchmarks.bench_scan_nav
