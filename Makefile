@@ -69,6 +69,7 @@ bench: setup  ## measure speed side by side with the alternatives, into benchmar
 	$(BIN)/python -m benchmarks.bench_envs
 	$(BIN)/python -m benchmarks.bench_pretraining
 	$(BIN)/python -m benchmarks.bench_memory
+	$(BIN)/python -m benchmarks.bench_scale
 	$(BIN)/python -m benchmarks.bench_frozen
 	$(BIN)/python -m benchmarks.bench_finetuning
 	$(BIN)/python -m benchmarks.bench_auxiliary

@@ -1,20 +1,23 @@
-"""One table for a machine with a GPU: pretraining and RL, in wall-clock time, in a few minutes.
+"""One table for a machine with a GPU: pretraining and RL, in a few minutes.
 
 Transitions per second of pretraining for every objective: a straightforward loop (``benchmarks.bench_pretraining``),
 ours in float32, with ``precision: bf16``, and both with ``torch.compile`` on encoders, which is no option of ours and
 shows whether it should be one. Then steps per second of PPO and DQN, fine-tuned and on a frozen encoder
-(``benchmarks.bench_frozen``). Contenders work in turns within one process; each cell is the median of its turns and
-their range. The table names the hardware. ``python -m benchmarks.gpu``; it runs on a CPU, too.
+(``benchmarks.bench_frozen``). Contenders work in turns within one process. A cell is the median speed of the turns and,
+in parentheses, the median and the range of its ratio to the reference in the same round. The table names the hardware.
+``python -m benchmarks.gpu``; with ``--device cpu`` it takes processor time, which load disturbs less than the clock.
 """
 
 import argparse
 import functools
 import platform
+import shlex
 import statistics
+import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from benchmarks.tables import write_page
 
 RESULTS = Path(__file__).parent / "results" / "gpu.md"
 ARMS = ("straightforward", "float32", "bf16", "compile", "bf16+compile")
+REFERENCE = "float32"
 ENV_IDS = ("Nav2D-v0", "PointMaze-v0")
 # Steps of one call of `learn`: a rollout of sixteen environments, and many updates.
 RL_STEPS = {"ppo": 16 * N_STEPS, "dqn": 1_000}
@@ -83,27 +87,34 @@ def in_turns(
     :param device: "cuda" is waited for at both ends of a turn
     """
     wait = th.cuda.synchronize if device == "cuda" else (lambda: None)
+    clock = time.perf_counter if device == "cuda" else time.process_time
     for call in contenders.values():
         call()
     found: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds):
         for name, call in contenders.items():
             wait()
-            n_calls, start = 0, time.perf_counter()
-            while not n_calls or time.perf_counter() - start < seconds:
+            n_calls, start = 0, clock()
+            while not n_calls or clock() - start < seconds:
                 call()
                 n_calls += 1
             wait()
-            found[name].append(n_calls * work / (time.perf_counter() - start))
+            found[name].append(n_calls * work / (clock() - start))
     return found
 
 
-def cell(speeds: Sequence[float]) -> str:
-    """Median and range.
+def cells(found: dict[str, list[float]], reference: str) -> str:
+    """A row: the median speed of each contender, and its ratio to the reference in the same rounds.
 
-    :param speeds: of the turns
+    :param found: of :func:`in_turns`
+    :param reference: one of the contenders
     """
-    return f"{statistics.median(speeds):,.0f} ({min(speeds):,.0f} to {max(speeds):,.0f})"
+    row = []
+    for speeds in found.values():
+        ratios = [own / other for own, other in zip(speeds, found[reference], strict=True)]
+        ratio = f"{statistics.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}"
+        row.append(f"{statistics.median(speeds):,.0f} ({ratio})")
+    return " | ".join(row)
 
 
 def pretraining_rows(args: argparse.Namespace, folder: Path) -> list[str]:
@@ -117,7 +128,7 @@ def pretraining_rows(args: argparse.Namespace, folder: Path) -> list[str]:
         for objective in args.objectives:
             contenders = {arm: make_arm(arm, objective, data, folder, args.device) for arm in args.arms}
             found = in_turns(contenders, BATCH_SIZE, args.rounds, args.seconds, args.device)
-            rows.append(f"| `{objective}`, {env_id} | {' | '.join(cell(found[arm]) for arm in args.arms)} |")
+            rows.append(f"| `{objective}`, {env_id} | {cells(found, REFERENCE)} |")
             print(rows[-1], flush=True)
     return rows
 
@@ -137,7 +148,7 @@ def rl_rows(args: argparse.Namespace) -> list[str]:
             # Stable-Baselines3 warns of PPO on a GPU without images; that is what is measured.
             warnings.simplefilter("ignore", UserWarning)
             found = in_turns(contenders, work, args.rounds, args.seconds, args.device)
-        rows.append(f"| {title} | {' | '.join(cell(found[kind]) for kind in KINDS)} |")
+        rows.append(f"| {title} | {cells(found, KINDS[0])} |")
         print(rows[-1], flush=True)
     return rows
 
@@ -153,8 +164,11 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--transitions", type=int, default=20_000, help="of each dataset (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=3, help="turns of each contender (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=1.0, help="of a turn (default: %(default)s)")
-    parser.add_argument("--rl-steps", type=int, help="steps of one call of learn (default: those of a rollout or more)")
+    parser.add_argument("--rl-steps", type=int, help="of one call of learn (default: those of a rollout or more)")
+    parser.add_argument("--no-rl", action="store_true", help="leave out the second table")
     args = parser.parse_args(argv)
+    if REFERENCE not in args.arms:
+        parser.error(f"--arms must name {REFERENCE}, the reference")
     if args.device == "cuda" and not th.cuda.is_available():
         parser.exit(2, "python -m benchmarks.gpu: error: there is no GPU; give --device cpu\n")
     from sb3_abisim.common.malloc import keep_freed_memory
@@ -162,12 +176,16 @@ def main(argv: list[str] | None = None) -> None:
     keep_freed_memory()
     with tempfile.TemporaryDirectory() as folder:
         rows = pretraining_rows(args, Path(folder))
-    tail = ["Steps of RL per second:", "", f"| algorithm, environment | {' | '.join(KINDS)} |"]
-    tail += [f"|---|{'---:|' * len(KINDS)}", *rl_rows(args), ""]
+    tail: list[str] = []
+    if not args.no_rl:
+        tail = [f"Steps of RL per second; the reference is {KINDS[0]}:", "", "| algorithm, environment | "]
+        tail[-1] += f"{' | '.join(KINDS)} |"
+        tail += [f"|---|{'---:|' * len(KINDS)}", *rl_rows(args), ""]
+    words = shlex.join(sys.argv[1:] if argv is None else argv)
     text = (
-        f"`python -m benchmarks.gpu --device {args.device}` on {hardware(args.device)}: transitions of pretraining per "
-        f"second of wall-clock time, batches of {BATCH_SIZE}, medians of {args.rounds} turns of {args.seconds:g} s and "
-        "their range."
+        f"`python -m benchmarks.gpu {words}` on {hardware(args.device)}: transitions of pretraining per second of "
+        f"{'wall-clock' if args.device == 'cuda' else 'processor'} time, batches of {BATCH_SIZE}, {args.rounds} turns "
+        f"of {args.seconds:g} s. In parentheses: the ratio to {REFERENCE} in the same round, median and range."
     )
     header = [f"| objective, environment | {' | '.join(args.arms)} |", f"|---|{'---:|' * len(args.arms)}"]
     write_page(args.output, "Speed on a GPU" if args.device == "cuda" else "Speed", text, header, rows, tuple(tail))

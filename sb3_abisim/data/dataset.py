@@ -6,9 +6,7 @@ back, which happens now and then.
 """
 
 import functools
-import mmap
 import os
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +15,6 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_abisim.common.arrays import ARRAY_ERRORS
 from sb3_abisim.common.files import file_hash
 from sb3_abisim.common.spaces import space_from_json
 from sb3_abisim.common.transitions import TransitionBatch
@@ -36,22 +33,17 @@ from sb3_abisim.data.format import (
     INSIDE,
     META_NAME,
     DatasetError,
-    array_file,
     array_layout,
     check_meta,
     from_json_file,
     holds_frames,
 )
+from sb3_abisim.data.shard_files import ShardFiles, repair
 
 # Above this size, opening a dataset compares sizes only; TransitionDataset(path, verify=True) compares hashes too.
 VERIFY_BELOW_BYTES = 4 * 10**9
-# A process may have 256 open on macOS. Of the paper's data at most 157 are used at a time.
-MAX_OPEN_FILES = 200
 # Files whose hash this process has found right: (path, size, time of the last change, sha256).
 _VERIFIED: set[tuple[str, int, int, str]] = set()
-# Bytes read between two times at which the mapped pages are given back. The system maps a page's neighbors with it, so
-# that up to twenty times as much was resident meanwhile. Pages stay in its cache: reading them again is cheap.
-RELEASE_AFTER_BYTES = 16 * 2**20
 
 Split = Literal["train", "eval"]
 # Steps between two observations: a number, or the fewest and the most of them.
@@ -104,12 +96,10 @@ class TransitionDataset:
         frames_per_shard = [shard["n_frames"] for shard in self.meta["shards"]]
         # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
         self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
-        # Open files, the last used ones at the end.
-        self._maps: OrderedDict[tuple[str, int], np.memmap[Any, Any]] = OrderedDict()
-        self._bytes_read = 0
+        self._files = ShardFiles(self.path, self.meta)
         n_shards = len(frames_per_shard)
-        self._actions = np.concatenate([self._read("actions", k) for k in range(n_shards)])
-        self._ends = np.concatenate([self._read("ends", k) for k in range(n_shards)])
+        self._actions = np.concatenate([self._files.whole("actions", k) for k in range(n_shards)])
+        self._ends = np.concatenate([self._files.whole("ends", k) for k in range(n_shards)])
         self._last = np.flatnonzero(self._ends != INSIDE)  # the last frame of each segment
         self._check_ends()
         self._remaining = steps_remaining(self._last)
@@ -318,43 +308,8 @@ class TransitionDataset:
         bounds = np.searchsorted(ascending, self._offsets)
         for shard in np.flatnonzero(np.diff(bounds)):
             here = slice(bounds[shard], bounds[shard + 1])
-            part = self._shard(name, int(shard))[ascending[here] - self._offsets[shard]]
-            out[order[here]] = part
-            self._bytes_read += part.nbytes
-            if self._bytes_read > RELEASE_AFTER_BYTES:
-                self._release_pages()
+            out[order[here]] = self._files.rows(name, int(shard), ascending[here] - self._offsets[shard])
         return out
-
-    def _release_pages(self) -> None:
-        self._bytes_read = 0
-        # Not on every platform.
-        if hasattr(mmap, "MADV_DONTNEED"):
-            for array in self._maps.values():
-                array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
-
-    def _shard(self, name: str, shard: int) -> NDArray[Any]:
-        """One array of a shard, memory-mapped at its first use."""
-        key = name, shard
-        if key not in self._maps:
-            self._maps[key] = self._read(name, shard, mmap_mode="r")
-            if len(self._maps) > MAX_OPEN_FILES:
-                self._maps.popitem(last=False)
-        self._maps.move_to_end(key)
-        # Indexing a plain array is faster than indexing its memory-mapped subclass.
-        return self._maps[key].view(np.ndarray)
-
-    def _read(self, name: str, shard: int, mmap_mode: Literal["r"] | None = None) -> Any:
-        path = self.path / array_file(name, shard)
-        dtype, row_shape = array_layout(self.meta, name)
-        try:
-            # Mapped in any case: where a header declares more than the file has, no memory is taken.
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except ARRAY_ERRORS as error:
-            raise DatasetError(f"{path} is not an array file of a dataset: {error}") from None
-        expected = (self.meta["shards"][shard]["n_frames"], *row_shape)
-        if array.dtype != dtype or array.shape != expected:
-            raise DatasetError(f"{path} holds {array.dtype} {array.shape}, its manifest says {dtype} {expected}")
-        return np.array(array) if mmap_mode is None else array
 
     def _check_files(self, verify: bool | None) -> None:
         entries = {name: entry for shard in self.meta["shards"] for name, entry in shard["files"].items()}
@@ -364,16 +319,16 @@ class TransitionDataset:
             try:
                 status = path.stat()
             except FileNotFoundError:
-                raise DatasetError(f"{path} is missing; {_repair(self.path, self.meta)}") from None
+                raise DatasetError(f"{path} is missing; {repair(self.path, self.meta)}") from None
             if status.st_size != entry["bytes"]:
                 raise DatasetError(
-                    f"{path} has {status.st_size} bytes instead of {entry['bytes']}; {_repair(self.path, self.meta)}"
+                    f"{path} has {status.st_size} bytes instead of {entry['bytes']}; {repair(self.path, self.meta)}"
                 )
             key = (str(path.resolve()), status.st_size, status.st_mtime_ns, entry["sha256"])
             if verify is False or (verify is None and (not small or key in _VERIFIED)):
                 continue
             if file_hash(path) != entry["sha256"]:
-                raise DatasetError(f"{path} is damaged (sha256 does not match); {_repair(self.path, self.meta)}")
+                raise DatasetError(f"{path} is damaged (sha256 does not match); {repair(self.path, self.meta)}")
             _VERIFIED.add(key)
 
     def _check_ends(self) -> None:
@@ -397,15 +352,3 @@ def _read_meta(path: Path) -> dict[str, Any]:
         remedy = "run the command that made the dataset again, in a new folder if it refuses"
         raise DatasetError(f"{path / META_NAME} is damaged, or not that of a dataset: {error}; {remedy}") from None
     return meta
-
-
-def _repair(path: Path, meta: dict[str, Any]) -> str:
-    if meta["source"] is not None:
-        return f"remove {path} and make it again from its source, {meta['source']}"
-    return (
-        "run the command that collected it again, which collects damaged shards anew: sb3-abisim collect "
-        f"--env {meta['env_id']} -n {meta['n_transitions']} --seed {meta['seed']} --n-envs {meta['n_envs']} "
-        f"-o {path.absolute()}"
-        + ("" if not meta["env_kwargs"] else " with its --env-kwargs")
-        + ("" if not meta.get("preprocessing") else f" and its preprocessing, {meta['preprocessing']}")
-    )

@@ -24,6 +24,12 @@ def test_it_writes_both_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert all(float(cell.split()[0].replace(",", "")) > 0 for cell in rows[name])
 
 
+def test_ratios_are_those_of_a_round() -> None:
+    assert gpu.cells({"a": [1000.0, 10.0, 5.0], "b": [500.0, 20.0, 20.0]}, "a") == (
+        "10 (1.00, 1.00 to 1.00) | 20 (2.00, 0.50 to 4.00)"
+    )
+
+
 def test_turns_alternate_and_count_what_a_call_does() -> None:
     calls: list[str] = []
     contenders = {name: (lambda name=name: calls.append(name)) for name in ("a", "b")}

@@ -3,6 +3,7 @@
 import functools
 import json
 import pickle
+import shutil
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,9 +16,10 @@ import pytest
 from dataset_inputs import N, collect_index
 
 import sb3_abisim.data.dataset as dataset_module
+import sb3_abisim.data.shard_files as shard_files
 from sb3_abisim.common.spaces import space_from_json, space_to_json
 from sb3_abisim.data.dataset import TransitionDataset
-from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED, is_shard_file
+from sb3_abisim.data.format import CUT, INSIDE, TERMINATED, TRUNCATED, DatasetError, is_shard_file
 from sb3_abisim.data.writer import Segment, open_writer, write_dataset
 
 
@@ -148,29 +150,30 @@ def test_sequences_hold_every_action_in_between(dataset: TransitionDataset) -> N
 def test_pages_that_were_read_are_given_back(
     dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch, limit: int, stays: bool
 ) -> None:
-    monkeypatch.setattr(dataset_module, "RELEASE_AFTER_BYTES", limit)
+    monkeypatch.setattr(shard_files, "RELEASE_AFTER_BYTES", limit)
     frames = dataset.frames(np.arange(dataset.n_frames))
     lines = Path("/proc/self/smaps").read_text().splitlines()
     maps = [i for i, line in enumerate(lines) if "frames-00000.npy" in line and str(dataset.path) in line]
     resident = [int(line.split()[1]) for i in maps for line in lines[i : i + 6] if line.startswith("Rss:")]
     assert len(resident) > 0 and (sum(resident) > 0) == stays
-    assert stays or dataset._bytes_read == 0
+    assert stays or dataset._files.bytes_read == 0
     np.testing.assert_array_equal(dataset.frames(np.arange(dataset.n_frames)), frames)
 
 
 def test_pages_are_given_back_within_a_large_read(dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     row = dataset.frames(np.array([0])).nbytes
-    monkeypatch.setattr(dataset_module, "RELEASE_AFTER_BYTES", 100 * row)
+    monkeypatch.setattr(shard_files, "RELEASE_AFTER_BYTES", 100 * row)
     times = []
+    files = dataset._files
     monkeypatch.setattr(
-        dataset, "_release_pages", lambda: (times.append(dataset._bytes_read), setattr(dataset, "_bytes_read", 0))
+        files, "release_pages", lambda: (times.append(files.bytes_read), setattr(files, "bytes_read", 0))
     )
     dataset.frames(np.arange(dataset.n_frames))
     largest = max(shard["n_frames"] for shard in dataset.meta["shards"])
     assert largest < 100, "several parts make up the limit"
     assert len(times) > 1 and all(100 * row < read <= (100 + largest) * row for read in times)
     times.clear()
-    monkeypatch.setattr(dataset, "_bytes_read", 0)
+    monkeypatch.setattr(files, "bytes_read", 0)
     dataset.frames(np.arange(100) % 50)
     assert times == [], "the limit itself is not beyond it"
 
@@ -281,13 +284,33 @@ def test_bad_indices_are_refused(dataset: TransitionDataset, index: object) -> N
 
 
 def test_more_shards_than_a_process_may_have_open(dataset: TransitionDataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    everything = np.arange(dataset.n_frames)
-    before = dataset.frames(everything)
-    monkeypatch.setattr(dataset_module, "MAX_OPEN_FILES", 3)
+    everything = np.random.default_rng(0).permutation(np.arange(dataset.n_frames).repeat(2))
+    before, factors = dataset.frames(everything), dataset.factors(everything)
+    monkeypatch.setattr(shard_files, "MAX_OPEN_FILES", 3)
     few = TransitionDataset(dataset.path)
+    opened: list[str] = []
+    load = np.load
+    monkeypatch.setattr(np, "load", lambda path, **kwargs: opened.append(Path(path).name) or load(path, **kwargs))
     for _ in range(2):
         assert np.array_equal(few.frames(everything), before)
-        assert len(dataset.meta["shards"]) > len(few._maps) == 3
+        assert all(np.array_equal(array, factors[name]) for name, array in few.factors(everything).items())
+        assert len(dataset.meta["shards"]) > len(few._files.maps) == 3
+    # The header of each file was compared, and was so once.
+    assert len(opened) == len(set(opened)) == len(dataset.meta["shards"]) * (1 + len(factors))
+
+
+def test_a_file_cut_short_while_it_is_used_is_an_error(
+    dataset: TransitionDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied = shutil.copytree(dataset.path, tmp_path / "copy")
+    monkeypatch.setattr(shard_files, "MAX_OPEN_FILES", 0)
+    reader = TransitionDataset(copied)
+    everything = np.arange(reader.n_frames)
+    reader.frames(everything)
+    with open(copied / "frames-00001.npy", "r+b") as file:
+        file.truncate(400)
+    with pytest.raises(DatasetError, match=r"frames-00001.npy ends early; run the command that collected it again"):
+        reader.frames(everything)
 
 
 def test_splits_share_no_segment(folder: Path) -> None:
