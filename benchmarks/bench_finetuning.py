@@ -24,8 +24,8 @@ AIM = 1.5
 # Whether each contender learns the same as the plain one, from the same numbers.
 CONTENDERS = {
     "plain": "",
-    "weights with channels first": "to rounding",
-    "observations with channels last": "the same bits",
+    "weights and observations with channels first": "to rounding",
+    "observations with channels first": "the same bits",
     "`torch.autocast` to bfloat16": "no",
     "minibatches of 1,024": "no",
     "4 epochs": "no",
@@ -44,22 +44,18 @@ def make_model(contender: str) -> Any:
     from torch import nn
 
     from sb3_abisim import ActionBisimExtractor, BatchedVecEnv
-    from sb3_abisim.networks.base import set_memory_format
-
-    class ChannelsLast(ActionBisimExtractor):
-        def forward(self, observations: th.Tensor) -> th.Tensor:
-            return super().forward(observations.contiguous(memory_format=th.channels_last))
+    from sb3_abisim.networks.base import Encoder, set_memory_format
 
     class BFloat16(ActionBisimExtractor):
         def forward(self, observations: th.Tensor) -> th.Tensor:
             with th.autocast("cpu", th.bfloat16):
                 return super().forward(observations).float()
 
-    classes = {"observations with channels last": ChannelsLast, "`torch.autocast` to bfloat16": BFloat16}
+    is_bfloat16 = "bfloat16" in contender
     env = VecNormalize(make_vec_env(ENV_ID, N_ENVS, seed=0, vec_env_cls=BatchedVecEnv), norm_obs=False)
     policy_kwargs = {
         "net_arch": [256], "activation_fn": nn.ReLU,
-        "features_extractor_class": classes.get(contender, ActionBisimExtractor),
+        "features_extractor_class": BFloat16 if is_bfloat16 else ActionBisimExtractor,
         "features_extractor_kwargs": {"encoder": f"{ENV_ID}/abisim"},
     }  # fmt: skip
     model = PPO(
@@ -67,8 +63,11 @@ def make_model(contender: str) -> Any:
         n_epochs=4 if contender == "4 epochs" else N_EPOCHS, learning_rate=2.5e-5, policy_kwargs=policy_kwargs,
         device="cpu", seed=0,
     )  # fmt: skip
-    if contender == "weights with channels first":
-        set_memory_format(model.policy.features_extractor.encoder, th.contiguous_format)
+    encoder: Any = model.policy.features_extractor.encoder
+    if contender == "weights and observations with channels first":
+        set_memory_format(encoder, th.contiguous_format)
+    if "with channels first" in contender:
+        encoder.forward = lambda observations: Encoder.forward(encoder, th.add(-1.0, observations, alpha=2.0))
     return model
 
 

@@ -15,7 +15,13 @@ def use_one_core() -> None:
 
 def machine() -> str:
     """For the text above a table."""
-    return f"one core of {platform.machine()}, Python {platform.python_version()}"
+    core = f"one core of {platform.machine()}, Python {platform.python_version()}"
+    # Other work also costs processor time: it takes caches and memory.
+    return (
+        f"{core}, load average {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores"
+        if hasattr(os, "getloadavg")
+        else core
+    )
 
 
 def write_page(

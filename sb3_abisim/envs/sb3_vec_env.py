@@ -1,7 +1,7 @@
 """The environments of this package as a batched VecEnv of Stable-Baselines3: one call moves all copies.
 
 ``DummyVecEnv`` steps its environments one after the other, each a batch of one. Here the copies are rows of a single
-batch, stepped at once; ``Monitor`` and all other wrappers stay around each copy as they were.
+batch, stepped at once; ``Monitor`` and all other wrappers stay around each copy.
 
 Given a Gymnasium ``VectorEnv`` of anybody, :class:`BatchedVecEnv` is a :class:`VectorEnvAdapter` to it.
 """
@@ -27,6 +27,9 @@ from sb3_abisim.envs.plain_wrappers import PlainWrappers
 
 class BatchedVecEnv(DummyVecEnv):
     """``DummyVecEnv`` for the environments of this package: the same observations, rewards and infos, sooner.
+
+    Where all wrappers of a copy are Gymnasium's and Stable-Baselines3's usual ones, they are called at the ends of
+    episodes alone (:mod:`sb3_abisim.envs.plain_wrappers`).
 
     :param env_fns: functions that make the environments: all ``gymnasium.make`` of one id of this package with the
         same arguments, in any wrappers that leave actions as they are and do not look at the environment

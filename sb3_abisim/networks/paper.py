@@ -45,7 +45,11 @@ class PaperEncoder(Encoder):
         :return: float (batch, features_dim)
         """
         # 2 x - 1 in one pass over memory.
-        return super().forward(th.add(-1.0, observations, alpha=2.0))
+        inputs = th.add(-1.0, observations, alpha=2.0)
+        if th.is_grad_enabled() and not th.compiler.is_exporting():
+            # The first convolution would do so forwards and again backwards. The numbers are the same.
+            inputs = inputs.contiguous(memory_format=th.channels_last)
+        return super().forward(inputs)
 
 
 class Nav2DEncoder(PaperEncoder):

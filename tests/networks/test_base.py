@@ -9,7 +9,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_abisim import registry
-from sb3_abisim.networks.base import make_encoder, preprocess, set_memory_format
+from sb3_abisim.networks.base import Encoder, make_encoder, preprocess, set_memory_format
 from sb3_abisim.registry import register_network
 
 BUILT_IN = {name: network for name, network in registry.networks().items() if network.observation_shape}
@@ -303,3 +303,24 @@ def test_arguments_of_a_networks_own_stay_its_own():
 def test_other_features_are_refused(kwargs, message):
     with pytest.raises(ValueError, match=message):
         make_encoder(image_space(3, 15, 15), None, **kwargs)
+
+
+@pytest.mark.parametrize("name", ["Nav2DEncoder", "PointMazeEncoder", "ScanNavEncoder"])
+def test_the_layout_of_observations_changes_speed_alone(name):
+    """Those that gradients are recorded of lie with channels last; embeddings and gradients are the same to the bit."""
+    shape = BUILT_IN[name].observation_shape
+    encoder = make_encoder(image_space(*shape), name)
+    strides = []
+    encoder.layers[0].register_forward_pre_hook(lambda _, inputs: strides.append(inputs[0].stride()))
+    observations = th.rand(8, *shape, generator=th.Generator().manual_seed(0))
+    results = []
+    for forward in (encoder, lambda x: Encoder.forward(encoder, 2 * x - 1)):
+        encoder.zero_grad()
+        embeddings = forward(observations)
+        embeddings.square().sum().backward()
+        results.append([embeddings, *(parameter.grad.clone() for parameter in encoder.parameters())])
+    assert all(th.equal(one, other) for one, other in zip(*results, strict=True))
+    with th.no_grad():
+        assert th.equal(encoder(observations), results[0][0])
+    # The stride of the channels.
+    assert [stride[1] == 1 for stride in strides] == [True, False, False]

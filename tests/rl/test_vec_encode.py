@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecTrans
 from sb3_abisim.networks import base as networks
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.networks.encoder_name import EncoderNotFoundError
+from sb3_abisim.rl import vec_encode
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
 
 
@@ -175,3 +176,10 @@ def test_a_model_is_not_continued_on_another_encoder(path: Path, tmp_path: Path)
     assert EncodedBox(3, "ab") == EncodedBox(3, "ab") != EncodedBox(4, "ab")
     assert EncodedBox(3, "ab") != spaces.Box(-np.inf, np.inf, (3,), np.float32)
     assert repr(EncodedBox(3, "ab")) == "EncodedBox(3, hash='ab')"
+
+
+def test_freed_memory_is_kept(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = []
+    monkeypatch.setattr(vec_encode, "keep_freed_memory", lambda: kept.append(True))
+    VecEncodeObservations(counters(length=3), str(path))
+    assert kept

@@ -77,8 +77,8 @@ class Images:
 
     def _new_bytes(self, data: bytes) -> int:
         """Of a file: the same bytes grant no more pixels under another name."""
-        digest = hashlib.sha256(data).digest()
-        known, self._seen = digest in self._seen, self._seen | {digest}
+        content_hash = hashlib.sha256(data).digest()
+        known, self._seen = content_hash in self._seen, self._seen | {content_hash}
         return 0 if known else len(data)
 
     def _decode(self, data: bytes, name: str) -> Image:
