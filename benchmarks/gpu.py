@@ -23,7 +23,7 @@ from typing import Any
 
 import torch as th
 
-from benchmarks.bench_frozen import KINDS, N_STEPS, make_model
+from benchmarks.bench_frozen import KINDS, SETTINGS, make_model
 from benchmarks.bench_pretraining import BATCH_SIZE, make_run, ours, straightforward
 from benchmarks.tables import write_page
 
@@ -32,7 +32,6 @@ ARMS = ("straightforward", "float32", "bf16", "compile", "bf16+compile")
 REFERENCE = "float32"
 ENV_IDS = ("Nav2D-v0", "PointMaze-v0")
 # Steps of one call of `learn`: a rollout of sixteen environments, and many updates.
-RL_STEPS = {"ppo": 16 * N_STEPS, "dqn": 1_000}
 
 
 def hardware(device: str) -> str:
@@ -136,19 +135,19 @@ def pretraining_rows(args: argparse.Namespace, folder: Path) -> list[str]:
 def rl_rows(args: argparse.Namespace) -> list[str]:
     """Rows of the second table."""
     rows = []
-    for algo, title in (("ppo", "PPO, DistractorPointMaze-v0"), ("dqn", "DQN, Nav2D-v0")):
-        n_steps = args.rl_steps or RL_STEPS[algo]
-        models = {kind: make_model(algo, kind, args.device) for kind in KINDS}
+    for setting in (each for each in SETTINGS if each.kinds == KINDS):
+        n_steps = args.rl_steps or setting.n_steps
+        models = {kind: make_model(setting, kind, args.device) for kind in KINDS}
         contenders = {
             kind: functools.partial(model.learn, n_steps, reset_num_timesteps=False) for kind, model in models.items()
         }
         # PPO fills its rollout whatever the number of steps.
-        work = max(n_steps, RL_STEPS[algo] if algo == "ppo" else 0)
+        work = max(n_steps, setting.n_envs * setting.kwargs.get("n_steps", 0))
         with warnings.catch_warnings():
             # Stable-Baselines3 warns of PPO on a GPU without images; that is what is measured.
             warnings.simplefilter("ignore", UserWarning)
             found = in_turns(contenders, work, args.rounds, args.seconds, args.device)
-        rows.append(f"| {title} | {cells(found, KINDS[0])} |")
+        rows.append(f"| {setting.title} | {cells(found, KINDS[0])} |")
         print(rows[-1], flush=True)
     return rows
 

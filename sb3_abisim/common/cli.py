@@ -5,6 +5,7 @@ Nothing heavy is imported here, so that ``--help`` answers at once.
 
 import argparse
 import ast
+import errno
 import functools
 import importlib
 import re
@@ -17,6 +18,18 @@ from sb3_abisim.common.text import printable
 from sb3_abisim.registry import import_network, is_import_path, load_plugins, name_package
 
 PROGRAM = "sb3-abisim"
+# By what the system says.
+_REMEDIES = {
+    errno.EACCES: "allow it, or name another place",
+    errno.EPERM: "allow it, or name another place",
+    errno.EROFS: "name a place that can be written",
+    errno.EEXIST: "something else is there; name another place",
+    errno.ENOTDIR: "a file is where a folder should be; name another place",
+    errno.EISDIR: "a folder is where a file should be; name a file",
+    errno.ENOENT: "correct the path",
+    errno.ENOSPC: "free some space and run the same command again",
+    errno.ELOOP: "a link leads to itself; name another place",
+}
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
 
 
@@ -108,9 +121,9 @@ def run(
         import_packages(args.packages)
         code = function(args)
     except (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, ImportError) as error:
-        parser.exit(2, f"{parser.prog}: error: {one_line(error)}\n")
+        parser.exit(2, f"{parser.prog}: error: {_with_remedy(error)}\n")
     except (OSError, FloatingPointError) as error:
-        parser.exit(1, f"{parser.prog}: {one_line(error)}\n")
+        parser.exit(1, f"{parser.prog}: {_with_remedy(error)}\n")
     except MemoryError as error:
         what = str(error) and f" ({one_line(error)})"
         parser.exit(1, f"{parser.prog}: out of memory{what}; give it smaller inputs, or more memory\n")
@@ -130,9 +143,16 @@ def _say_in_one_line(
     program: str, usual: Callable[[threading.ExceptHookArgs], object], failed: threading.ExceptHookArgs
 ) -> None:
     if isinstance(failed.exc_value, OSError):
-        print(f"{program}: {one_line(failed.exc_value)}", file=sys.stderr)
+        print(f"{program}: {_with_remedy(failed.exc_value)}", file=sys.stderr)
     else:
         usual(failed)
+
+
+def _with_remedy(error: BaseException) -> str:
+    """A message in one line; what the system says of a path ends in what to do."""
+    remedy = _REMEDIES.get(error.errno or 0) if isinstance(error, OSError) else None
+    text = one_line(error)
+    return f"{text}; {remedy}" if remedy and ";" not in text else text
 
 
 def one_line(error: BaseException) -> str:

@@ -29,6 +29,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_set
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_abisim.common.pickle_size import check_pickle_size
 from sb3_abisim.networks.bounded import BoundedTensors
 from sb3_abisim.rl.unfreeze import unfreeze_encoder
 from sb3_abisim.zoo.named import named_class, named_policy_kwargs
@@ -231,6 +232,9 @@ def _read_data(path: Path) -> tuple[dict[str, Any], int]:
             if name.endswith(".pth"):
                 with zipfile.ZipFile(io.BytesIO(archive.read(name))) as inner:
                     _require_stored(inner, size)
+                    for part in inner.namelist():
+                        if part.endswith(".pkl"):
+                            check_pickle_size(inner.read(part))
         data = json.loads(archive.read(_DATA_NAME))
     if not isinstance(data, dict):
         raise ValueError("its data are no mapping")

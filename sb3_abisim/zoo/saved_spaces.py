@@ -13,6 +13,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_abisim.common.pickle_size import check_pickle_size
+
 # Whatever else a pickle names is refused. The generators are those of random numbers, whose state a space keeps.
 _NAMES = {
     "gymnasium.spaces.box": {"Box"},
@@ -38,6 +40,7 @@ _NORMALIZE = {
 
 class _Unpickler(pickle.Unpickler):
     def __init__(self, data: bytes, names: Mapping[str, set[str]] = MappingProxyType(_NAMES)) -> None:
+        check_pickle_size(data)
         super().__init__(io.BytesIO(data))
         self._names = names
 

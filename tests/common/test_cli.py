@@ -126,8 +126,19 @@ def test_packages_are_imported_first_or_named(capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize(
     ("error", "code", "message"),
     [
-        (PermissionError(13, "Permission denied", "/data/meta.json"), 1, "Permission denied: '/data/meta.json'"),
-        (OSError(28, "No space left on device"), 1, "No space left on device"),
+        (
+            PermissionError(13, "Permission denied", "/data/meta.json"),
+            1,
+            "denied: '/data/meta.json'; allow it, or name",
+        ),
+        (
+            OSError(28, "No space left on device"),
+            1,
+            "No space left on device; free some space and run the same command",
+        ),
+        (FileExistsError(17, "File exists", "/x"), 2, "File exists: '/x'; something else is there; name another place"),
+        (NotADirectoryError(20, "Not a directory", "/x/y"), 2, "'/x/y'; a file is where a folder should be"),
+        (OSError(28, "full; training has stopped"), 1, "full; training has stopped\n"),
         (MemoryError(), 1, "out of memory; give it smaller inputs"),
         (MemoryError("Unable to allocate 8 TiB"), 1, "out of memory (Unable to allocate 8 TiB); give it"),
         (RecursionError("maximum"), 2, "error: an input is nested too deeply to be read"),

@@ -36,18 +36,18 @@ class Budget:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._counts = {"faces": 0, "vertices": 0, "instances": 0}
+        self._counts = {"faces": 0, "vertices": 0, "instances": 0, "morph targets": 0}
         self._pixels = self._image_bytes = 0
 
     def add(self, what: str, number: int) -> None:
         """Count what is about to be read.
 
-        :param what: "faces", "vertices" or "instances"
+        :param what: "faces", "vertices", "instances" or "morph targets", each as often as it is shown
         :param number: of them
         :raises SceneError: for more than the limit
         """
         self._counts[what] += number
-        limit = {"faces": MAX_FACES, "vertices": MAX_VERTICES, "instances": MAX_INSTANCES}[what]
+        limit = {"faces": MAX_FACES, "vertices": MAX_VERTICES}.get(what, MAX_INSTANCES)
         if self._counts[what] > limit:
             raise SceneError(
                 f"{self._path} declares {self._counts[what]} {what}, more than {limit}; decimate the scan, or cut it "

@@ -186,6 +186,7 @@ class GltfScene:
         for weight, target in zip(weights, targets, strict=False):
             if weight == 0:
                 continue
+            self._file.budget.add("morph targets", 1)
             if other := sorted(name for name in target if name not in ("POSITION", "NORMAL", "TANGENT")):
                 raise self._file.bad(
                     f"morphs {', '.join(other)}, which is not supported", "apply the shape and export it again without"

@@ -108,7 +108,15 @@ class Images:
 
 
 def _channels(image: Any) -> Image:
-    rgb = np.asarray(image.convert("RGB"), dtype=np.uint8)
-    if "A" not in image.getbands() and "transparency" not in image.info:
-        return rgb, None
-    return rgb, np.asarray(image.convert("RGBA").getchannel("A"), dtype=np.uint8)
+    """Colors and alpha, in strips: Pillow keeps four bytes of each pixel, and copies them on the way."""
+    image.load()
+    width, height = image.size
+    rgb, alpha = np.empty((height, width, 3), dtype=np.uint8), None
+    if "A" in image.getbands() or "transparency" in image.info:
+        alpha = np.empty((height, width), dtype=np.uint8)
+    for top in range(0, height, 256):
+        strip = image.crop((0, top, width, min(top + 256, height)))
+        rgb[top : top + 256] = strip.convert("RGB")
+        if alpha is not None:
+            alpha[top : top + 256] = strip.convert("RGBA").getchannel("A")
+    return rgb, alpha

@@ -10,7 +10,7 @@ from sb3_abisim.envs.scan_nav.files import Budget, ScanFiles, SceneError
 from sb3_abisim.envs.scan_nav.images import Images
 from sb3_abisim.envs.scan_nav.mtl import Material, Texture, material_name, read_library
 from sb3_abisim.envs.scan_nav.polygons import PolygonError, triangulate
-from sb3_abisim.envs.scan_nav.surfaces import HALF_SEEN, Opacity, Part, Surface
+from sb3_abisim.envs.scan_nav.surfaces import HALF_SEEN, Opacity, Part, Surface, each_number
 from sb3_abisim.envs.scan_nav.vertex_colors import MISSING_COLOR, to_bytes
 
 # Statements that change neither shapes nor colors: names of groups, normals, smoothing, rendering.
@@ -54,18 +54,20 @@ class ObjFile:
             return []
         corners, lengths = self._corners(len(vertices), len(coordinates))
         self._budget.add("faces", max(len(corners) - 2 * len(lengths), 0))
-        owner = np.array(self._materials)
         names = {number: name for name, number in self._names.items()}
-        textured = np.minimum.reduceat(corners[:, 1], np.cumsum(lengths) - lengths) >= 0
-        parts = []
         # The last material first: of two faces in one plane, the one that is added last is seen.
-        for number in sorted(set(self._materials), key=self._materials.index, reverse=True):
-            material = self._material(names[number], materials)
-            for with_texture in (False, True):
-                chosen = (owner == number) & (textured == with_texture)
-                if chosen.any():
-                    taken = corners[np.repeat(chosen, lengths)]
-                    parts.append(self._part(taken, lengths[chosen], vertices, colors, coordinates, material))
+        order = list(dict.fromkeys(self._materials))[::-1]
+        rank = np.empty(len(names), dtype=np.int64)
+        rank[order] = np.arange(len(order))
+        starts = np.cumsum(lengths) - lengths
+        textured = np.minimum.reduceat(corners[:, 1], starts) >= 0
+        parts = []
+        for key, faces in each_number(2 * rank[self._materials] + textured):
+            n = lengths[faces]
+            # Corners of the faces, one after the other.
+            taken = np.arange(n.sum()) + np.repeat(starts[faces] - (np.cumsum(n) - n), n)
+            material = self._material(names[order[key // 2]], materials)
+            parts.append(self._part(corners[taken], n, vertices, colors, coordinates, material))
         if not self._any_gray:
             # Vertices have all the colors that there are; nobody misses a library.
             self._files.missing[:] = [name for name in self._files.missing if name not in self._lost_libraries]

@@ -13,7 +13,7 @@ from sb3_abisim.envs.scan_nav.files import Budget, ScanFiles, SceneError
 from sb3_abisim.envs.scan_nav.images import Images
 from sb3_abisim.envs.scan_nav.ply_elements import Element, read_ply
 from sb3_abisim.envs.scan_nav.polygons import PolygonError, triangulate
-from sb3_abisim.envs.scan_nav.surfaces import Part, Surface
+from sb3_abisim.envs.scan_nav.surfaces import Part, Surface, each_number
 from sb3_abisim.envs.scan_nav.vertex_colors import MISSING_COLOR, to_bytes
 
 _INDICES = ("vertex_indices", "vertex_index")
@@ -175,10 +175,7 @@ class PlyFile:
             raise self._bad(f"has a face with the texture {number.max()} of {len(names)}; export it again")
         number = np.where(np.isnan(where).any(axis=(1, 2)), -1, number)
         parts: list[Part] = []
-        for k in range(-1, len(names)):
-            mine = np.flatnonzero(number == k if k >= 0 else number < 0)
-            if not len(mine):
-                continue
+        for k, mine in each_number(np.maximum(number, -1)):
             found = self._files.find(names[k].strip("\"' ")) if k >= 0 else None
             if found is not None:
                 surface = Surface(len(mine), self._images.read(found)[0], where[mine])

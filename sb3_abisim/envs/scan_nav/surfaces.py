@@ -1,5 +1,6 @@
 """How the triangles of a scan are colored, and where one sees through them."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,6 +96,17 @@ def turned_over(surface: Surface) -> Surface:
     )
 
 
+def each_number(numbers: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Each different number, ascending, and its places; in one pass, however many there are.
+
+    :param numbers: (n,)
+    """
+    order = np.argsort(numbers, kind="stable")
+    values, starts = np.unique(numbers[order], return_index=True)
+    if len(values):
+        yield from zip(values.tolist(), np.split(order, starts[1:]), strict=True)
+
+
 def surface_runs(surfaces: tuple[Surface, ...]) -> NDArray[np.int64]:
     """Where each surface's faces end.
 
@@ -116,8 +128,8 @@ def colors_at(
     colors = np.zeros((len(face), 3), dtype=np.uint8)
     ends = surface_runs(surfaces)
     owner = np.searchsorted(ends, face, side="right")
-    for k in np.unique(owner):
-        surface, mine = surfaces[k], np.flatnonzero(owner == k)
+    for k, mine in each_number(owner):
+        surface = surfaces[k]
         local = face[mine] - (ends[k] - surface.n_faces)
         values = np.einsum("nk,nkd->nd", weights[mine], surface.coordinates[local])
         rgb = values if surface.texture is None else _sample(surface.texture, values, surface.wrap)
@@ -137,11 +149,10 @@ def solid_at(surfaces: tuple[Surface, ...], face: NDArray[np.int64], weights: ND
     solid = np.ones(len(face), dtype=bool)
     ends = surface_runs(surfaces)
     owner = np.searchsorted(ends, face, side="right")
-    for k in np.unique(owner):
+    for k, mine in each_number(owner):
         surface = surfaces[k]
         if surface.opacity is None:
             continue
-        mine = np.flatnonzero(owner == k)
         local = face[mine] - (ends[k] - surface.n_faces)
         alpha = np.einsum("nk,nk->n", weights[mine], surface.opacity.alpha[local])
         if surface.opacity.texture is not None:

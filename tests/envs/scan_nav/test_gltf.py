@@ -169,6 +169,15 @@ def colors_morphed(gltf):
     gltf.node(gltf.primitive(targets=[target]), mesh={"weights": [1.0]})
 
 
+def many_targets(gltf):
+    """Each copy is morphed anew."""
+    target = {"POSITION": gltf.accessor(FLOOR * np.float32(0.001))}
+    node = gltf.node(gltf.primitive(targets=[target] * 400), mesh={"weights": [1.0] * 400})
+    mesh = gltf.header["nodes"][node]["mesh"]
+    for _ in range(300):
+        gltf.header["nodes"][gltf.node()]["mesh"] = mesh
+
+
 def unknown_mode(gltf):
     gltf.node(gltf.primitive(mode=7))
 
@@ -212,6 +221,7 @@ REFUSED = {
     skinned: r"by a skeleton \(skin\), which is not supported; apply the pose",
     animated: "moves its meshes by an animation.*export it without",
     colors_morphed: "morphs COLOR_0, which is not supported",
+    many_targets: "declares 100001 morph targets, more than 100000; decimate",
     unknown_mode: "faces of the unknown mode 7",
     two_scenes: "has 2 scenes and does not say which",
     loop: "its node 0 has several parents, or is its own",
