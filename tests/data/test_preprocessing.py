@@ -133,17 +133,19 @@ def test_a_wrapper_is_applied_and_recorded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "space",
+    ("space", "remedy"),
     [
-        spaces.Box(0, 1, (64, 64, 3), np.float32),
-        spaces.Box(0, 255, (4,), np.uint8),
-        spaces.Box(0, 10, (7, 7, 3), np.uint8),
-        spaces.Text(5),
+        (spaces.Box(0, 1, (64, 64, 3), np.float32), "RescaleObservation.*DtypeObservation"),
+        (spaces.Box(-np.inf, np.inf, (64, 64, 3), np.float32), "AddRenderObservation"),
+        (spaces.Box(0, 1, (64,), np.float32), "AddRenderObservation"),
+        (spaces.Box(0, 255, (4,), np.uint8), "AddRenderObservation"),
+        (spaces.Box(0, 10, (7, 7, 3), np.uint8), "AddRenderObservation"),
+        (spaces.Text(5), "AddRenderObservation"),
     ],
     ids=str,
 )
-def test_what_is_no_image_is_refused_with_the_remedy(space: gym.Space[Any]) -> None:
-    with pytest.raises(ValueError, match=r"uint8 images .*AddRenderObservation"):
+def test_what_is_no_image_is_refused_with_the_remedy(space: gym.Space[Any], remedy: str) -> None:
+    with pytest.raises(ValueError, match=f"uint8 images .*{remedy}"):
         ImageLayout.of(space)
 
 
