@@ -31,7 +31,6 @@ RESULTS = Path(__file__).parent / "results" / "gpu.md"
 ARMS = ("straightforward", "float32", "bf16", "compile", "bf16+compile")
 REFERENCE = "float32"
 ENV_IDS = ("Nav2D-v0", "PointMaze-v0")
-# Steps of one call of `learn`: a rollout of sixteen environments, and many updates.
 
 
 def hardware(device: str) -> str:
