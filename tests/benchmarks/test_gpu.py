@@ -4,14 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import bench_frozen, bench_pretraining, gpu
+from benchmarks import bench_pretraining, gpu
 
 
 def test_it_writes_both_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (gpu, bench_pretraining):
         monkeypatch.setattr(module, "BATCH_SIZE", 16)
-    monkeypatch.setattr(bench_frozen, "PPO", {**bench_frozen.PPO, "n_steps": 2, "batch_size": 32})
-    monkeypatch.setitem(gpu.RL_STEPS, "ppo", 32)
+    ppo, dqn = (setting for setting in gpu.SETTINGS if setting.kinds == gpu.KINDS)
+    small = ppo._replace(kwargs={**ppo.kwargs, "n_steps": 2, "batch_size": 32})
+    monkeypatch.setattr(gpu, "SETTINGS", (small, dqn))
     # Every kind of loop: pairs of single steps, of several, sequences of actions, a base and goals.
     sizes = ["--transitions", "1500", "--rounds", "1", "--seconds", "0", "--rl-steps", "4"]
     words = ["--device", "cpu", "--env", "Nav2D-v0", "--objectives", "acro", "info_nce", "goal_progress"]
