@@ -181,5 +181,5 @@ def test_a_model_is_not_continued_on_another_encoder(path: Path, tmp_path: Path)
 def test_freed_memory_is_kept(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = []
     monkeypatch.setattr(vec_encode, "keep_freed_memory", lambda: kept.append(True))
-    VecEncodeObservations(counters(length=3), str(path))
+    VecEncodeObservations(counters(), str(path))
     assert kept
