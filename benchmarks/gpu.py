@@ -38,7 +38,9 @@ def hardware(device: str) -> str:
 
     :param device: "cuda" or "cpu"
     """
-    name = th.cuda.get_device_name() if device == "cuda" else f"{th.get_num_threads()} threads of {platform.machine()}"
+    n = th.get_num_threads()
+    cpu = f"{n} {'thread' if n == 1 else 'threads'} of {platform.machine()}"
+    name = th.cuda.get_device_name() if device == "cuda" else cpu
     return f"{name}, PyTorch {th.__version__}, Python {platform.python_version()}"
 
 
