@@ -313,10 +313,10 @@ class Corpus(Layout):
                 )
         rows = "r,l,t\n" + "1,1,1\n" * 2_000_000
         cases["monitor of a large line"] = self._bench(
-            "0.monitor.csv", lambda _: b'#{"t_start": 0}\nr,l,t\n' + b"9" * 30_000_000
+            "0.monitor.csv", lambda _: b'#{"t_start": 0}\nr,l,t\n' + b"9" * 30_000_000, "export"
         )
         cases["monitor in depth"] = self._bench(
-            "0.monitor.csv", lambda _: b"#" + deep.encode() + b"\n" + rows[:100].encode()
+            "0.monitor.csv", lambda _: b"#" + deep.encode() + b"\n" + rows[:100].encode(), "export"
         )
         return cases
 

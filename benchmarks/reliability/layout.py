@@ -125,7 +125,7 @@ class Layout:
             where.write_bytes(pickled(place.parents[2]))
             if name.startswith("vec"):
                 config = place / ENV_ID / "config.yml"
-                config.write_text(config.read_text().rstrip() + "\n- - normalize\n  - true\n")
+                config.write_text(config.read_text().rstrip() + "\n  - - normalize\n    - true\n")
 
         return change
 

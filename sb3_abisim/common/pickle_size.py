@@ -1,10 +1,12 @@
-"""How large the objects of a pickle are, found out without opening it.
+"""How large the objects of a pickle are and what it calls, found out without opening it.
 
 A few bytes of a pickle can stand for a tuple of two tuples of two tuples, and so on: whoever goes through all of it, or
-takes it for a key of a dictionary, is at it for years.
+takes it for a key of a dictionary, is at it for years. And a class that may be named can be called with any arguments,
+such as the shape of a space that fills the memory, although nobody writes a pickle that does.
 """
 
 import pickletools
+from collections.abc import Container
 from typing import Any
 
 MAX_PARTS = 1_000_000
@@ -14,28 +16,35 @@ _SILENT = frozenset(("PROTO", "FRAME", "STOP"))
 _MARK: list[Any] = []
 
 
-def check_pickle_size(data: bytes) -> None:
-    """Refuse a pickle whose objects have too many parts, each counted as often as it is reached.
+def check_pickle_size(data: bytes, may_call: Container[str] | None = None) -> None:
+    """Refuse a pickle whose objects have too many parts, each counted as often as it is reached, or that calls others.
 
     :param data: the pickle, of which nothing is executed
-    :raises ValueError: for more than ``MAX_PARTS``, objects that hold themselves, and what is no pickle
+    :param may_call: functions, as ``module.name``; None for any
+    :raises ValueError: for more than ``MAX_PARTS``, objects that hold themselves, a call of something else, and what is
+        no pickle
     """
     try:
         sizes: dict[int, int] = {}
         # They are kept, so that no two have the same id.
-        nodes = _nodes(data)
+        nodes, called = _nodes(data)
         largest = max((_size(node, sizes) for node in nodes), default=0)
     except (ValueError, IndexError, KeyError, RecursionError) as error:
         raise ValueError(f"a pickle is damaged ({type(error).__name__}: {error})") from error
     if largest > MAX_PARTS:
         raise ValueError(f"a pickle holds more than {MAX_PARTS} parts, or itself")
+    others = [name for name in called if may_call is not None and name not in may_call]
+    if others:
+        raise ValueError(f"a pickle calls {others[0]}, which is not among what is called here")
 
 
-def _nodes(data: bytes) -> list[list[Any]]:
-    """All objects of a pickle, each the list of those that it is made of."""
+def _nodes(data: bytes) -> tuple[list[list[Any]], list[str]]:
+    """All objects of a pickle, each the list of those that it is made of, and the names of what it calls."""
     stack: list[list[Any]] = []
     memo: dict[int, list[Any]] = {}
     nodes: list[list[Any]] = []
+    texts: dict[int, str] = {}
+    called: list[str] = []
     for operation, argument, _ in pickletools.genops(data):
         name, before = operation.name, operation.stack_before
         if name in _SILENT:
@@ -56,13 +65,21 @@ def _nodes(data: bytes) -> list[list[Any]]:
                     taken.append(part)
                 n_below = before.index(pickletools.markobject)
             below = [stack.pop() for _ in range(n_below)]
+            if name == "REDUCE":
+                called.append(texts.get(id(below[1]), "what it has made"))
+            elif name in ("INST", "OBJ"):
+                called.append(str(argument).replace(" ", ".") if name == "INST" else "what it has named")
             if name in _MUTATES:
                 below[-1].extend(taken + below[:-1])
                 stack.append(below[-1])
             elif operation.stack_after:
                 nodes.append(taken + below)
                 stack.append(nodes[-1])
-    return nodes
+                if name == "STACK_GLOBAL":
+                    texts[id(nodes[-1])] = ".".join(texts.get(id(part), "?") for part in reversed(below))
+                elif isinstance(argument, str):
+                    texts[id(nodes[-1])] = argument.replace(" ", ".") if name == "GLOBAL" else argument
+    return nodes, called
 
 
 def _size(node: list[Any], sizes: dict[int, int]) -> int:

@@ -16,22 +16,34 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_abisim.common.pickle_size import check_pickle_size
 
 # Whatever else a pickle names is refused. The generators are those of random numbers, whose state a space keeps.
-_NAMES = {
+_CLASSES = {
     "gymnasium.spaces.box": {"Box"},
     "gymnasium.spaces.dict": {"Dict"},
     "gymnasium.spaces.discrete": {"Discrete"},
     "gymnasium.spaces.multi_binary": {"MultiBinary"},
     "gymnasium.spaces.multi_discrete": {"MultiDiscrete"},
     "sb3_abisim.rl.vec_encode": {"EncodedBox"},
+    "numpy": {"ndarray"},
+    "numpy.random._pcg64": {"PCG64"},
+    "numpy.random.bit_generator": {"SeedSequence"},
+}
+# Objects of the classes are filled with what the file holds; these alone are called.
+_FUNCTIONS = {
     "collections": {"OrderedDict"},
-    "numpy": {"dtype", "ndarray"},
+    "numpy": {"dtype"},
     "numpy._core.multiarray": {"_reconstruct", "scalar"},
     "numpy._core.numeric": {"_frombuffer"},
-    "numpy.random._pcg64": {"PCG64"},
     "numpy.random._pickle": {"__bit_generator_ctor", "__generator_ctor"},
-    "numpy.random.bit_generator": {"SeedSequence", "__pyx_unpickle_SeedSequence"},
+    "numpy.random.bit_generator": {"__pyx_unpickle_SeedSequence"},
 }
-
+_NAMES = {module: _CLASSES.get(module, set()) | _FUNCTIONS.get(module, set()) for module in {**_CLASSES, **_FUNCTIONS}}
+# As NumPy 1 wrote it, too.
+_CALLED = {
+    f"{module.replace('numpy._core.', core)}.{name}"
+    for module, names in _FUNCTIONS.items()
+    for name in names
+    for core in ("numpy._core.", "numpy.core.")
+}
 _NORMALIZE = {
     "stable_baselines3.common.vec_env.vec_normalize": {"VecNormalize"},
     "stable_baselines3.common.running_mean_std": {"RunningMeanStd"},
@@ -40,7 +52,7 @@ _NORMALIZE = {
 
 class _Unpickler(pickle.Unpickler):
     def __init__(self, data: bytes, names: Mapping[str, set[str]] = MappingProxyType(_NAMES)) -> None:
-        check_pickle_size(data)
+        check_pickle_size(data, _CALLED)
         super().__init__(io.BytesIO(data))
         self._names = names
 

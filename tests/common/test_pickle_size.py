@@ -79,3 +79,51 @@ def test_readers_of_saved_models_count_first(tmp_path: Path) -> None:
         archive.writestr("policy.pth", weights.getvalue())
     with pytest.raises(ValueError, match=r"model\.zip .*holds more than 1000000 parts"):
         read_weights(tmp_path / "model.zip")
+
+
+class Calls:
+    """What its pickle does instead of being filled."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = function, arguments
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+@pytest.mark.parametrize("protocol", (2, 4))
+@pytest.mark.parametrize(
+    "what",
+    [
+        Calls(gym.spaces.Box, 0, 1, (2, 2)),
+        Calls(gym.spaces.MultiBinary, 3),
+        Calls(np.random.SeedSequence, 1),
+    ],
+)
+def test_classes_of_spaces_are_never_called(what: Calls, protocol: int) -> None:
+    """With the shape of a whole memory it would be filled."""
+    with pytest.raises(ValueError, match=r"a pickle calls (gymnasium|numpy)\..*(Box|MultiBinary|SeedSequence)"):
+        read_space({":serialized:": base64.b64encode(pickle.dumps(what, protocol)).decode()})
+
+
+def test_calls_of_old_protocols_are_refused_where_calls_are_listed() -> None:
+    for data in (b"(I1\nicollections\nOrderedDict\n.", b"(ccollections\nOrderedDict\no."):
+        check_pickle_size(data)
+        with pytest.raises(ValueError, match="a pickle calls"):
+            check_pickle_size(data, {"numpy.dtype"})
+
+
+@pytest.mark.parametrize("seeded", [False, True])
+def test_spaces_that_are_whole_are_read(seeded: bool) -> None:
+    parts = {
+        "box": gym.spaces.Box(-1, 1, (2,)),
+        "n": gym.spaces.Discrete(3, start=2),
+        "m": gym.spaces.MultiDiscrete([2, 3]),
+    }
+    space = gym.spaces.Dict({**parts, "b": gym.spaces.MultiBinary(4)})
+    if seeded:
+        space.seed(3)
+        space.sample()
+    for protocol in (3, 4, 5):
+        found = read_space({":serialized:": base64.b64encode(pickle.dumps(space, protocol)).decode()})
+        assert found == space

@@ -154,7 +154,7 @@ def test_a_space_is_a_space(copied: Run, tmp_path: Path) -> None:
     wrong = spaces.Box(0, 255, (3, 15, 15), np.uint8)
     wrong._shape = (3, 10**6, 10**6)
     for value, message in (
-        (Execute(marker), "names pathlib.* which is not among"),
+        (Execute(marker), "calls pathlib.* which is not among"),
         (os.system, "names posix.system, which is not among"),
         (np.zeros(3), "a ndarray is no space"),
         (wrong, "bounds of a Box have another shape"),
