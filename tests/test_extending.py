@@ -63,6 +63,26 @@ def test_the_page_has_a_module_for_each_kind() -> None:
         assert f"register_{name}(" in text
 
 
+def _single_commands(folder: Path, tmp_path: Path, flags: list[str]) -> None:
+    """What the jobs of a benchmark do as well, which get by an entry point what these get by ``--packages``."""
+    words = ["--objective", "self_prediction", "--data", "data", "-o", "dot.safetensors"]
+    run(folder, tmp_path, "pretrain", *flags, *words, "-params", *SMALL_PRETRAIN)
+    card = json.loads((tmp_path / "dot.json").read_bytes())
+    assert "train/prediction_error" in card["curves"] and card["features_dim"] == 32
+    budget = ["-n", "64", "--eval-freq", "-1", "-f", "logs", "-params", *SMALL_PPO]
+    augmented = "self_prediction=dot.safetensors,augment=cutout"
+    for spec, label in ((augmented, False), ("self_prediction=dot.safetensors,frozen", True)):
+        output = run(folder, tmp_path, "train", "--algo", "ppo", *flags, "--conf-file", spec, *budget)
+        assert "Encoder" in output or "callback" not in output
+        record = json.loads(max((tmp_path / "logs").glob("ppo/*/*/method.json"), key=os.path.getmtime).read_bytes())
+        assert (record["method"], record["frozen"]) == ("self_prediction", label)
+        assert record["augment"] == (None if label else "cutout")
+        assert record["encoder_hash"]
+    run(folder, tmp_path, "analyze", "probes", *flags, "dot.safetensors", "-n", "20", "--images", "figures")
+    probes = json.loads((tmp_path / "figures" / "probes-my-Dot-v0.json").read_bytes())
+    assert "dot.safetensors" in probes["encoders"]
+
+
 @pytest.mark.parametrize("by", ["packages", "entry point"])
 def test_everything_runs_with_what_a_package_adds(package: Path, plugin: Path, tmp_path: Path, by: str) -> None:
     folder, flag = (package, ["--packages", "my_package"]) if by == "packages" else (plugin, [])
@@ -70,22 +90,8 @@ def test_everything_runs_with_what_a_package_adds(package: Path, plugin: Path, t
     run(folder, tmp_path, "collect", *flag, *env, "-n", "2000", "-o", "data")
     meta = json.loads((tmp_path / "data" / "meta.json").read_bytes())
     assert (meta["env_id"], list(meta["factors"])) == ("my/Dot-v0", ["position"])
-    words = ["--objective", "self_prediction", "--data", "data", "-o", "dot.safetensors"]
-    run(folder, tmp_path, "pretrain", *flag, *words, "-params", *SMALL_PRETRAIN)
-    card = json.loads((tmp_path / "dot.json").read_bytes())
-    assert "train/prediction_error" in card["curves"] and card["features_dim"] == 32
-    budget = ["-n", "64", "--eval-freq", "-1", "-f", "logs", "-params", *SMALL_PPO]
-    augmented = "self_prediction=dot.safetensors,augment=cutout"
-    for spec, label in ((augmented, False), ("self_prediction=dot.safetensors,frozen", True)):
-        output = run(folder, tmp_path, "train", *flag, "--algo", "ppo", *env, "--conf-file", spec, *budget)
-        assert "Encoder" in output or "callback" not in output
-        record = json.loads(max((tmp_path / "logs").glob("ppo/*/*/method.json"), key=os.path.getmtime).read_bytes())
-        assert (record["method"], record["frozen"]) == ("self_prediction", label)
-        assert record["augment"] == (None if label else "cutout")
-        assert record["encoder_hash"]
-    run(folder, tmp_path, "analyze", "probes", *flag, *env, "dot.safetensors", "-n", "20", "--images", "figures")
-    probes = json.loads((tmp_path / "figures" / "probes-my-Dot-v0.json").read_bytes())
-    assert "dot.safetensors" in probes["encoders"]
+    if by == "packages":
+        _single_commands(folder, tmp_path, [*flag, *env])
     small = ["--seeds", "0", "--n-transitions", "1000", "-n", "64", "--eval-freq", "32", "--eval-episodes", "1"]
     small += ["--n-eval-envs", "1", "--final-episodes", "1", "--device", "cpu", "-params", *SMALL_PPO]
     small += ["--pretrain-params", *SMALL_PRETRAIN, "--methods", "self_prediction", "vanilla", "-o", "benchmark"]
