@@ -12,6 +12,7 @@ from benchmarks import results_page
 
 RESULTS = results_page.ROOT / "docs" / "results.md"
 APPENDIX = results_page.ROOT / "docs" / "results_appendix.md"
+OTHERS = results_page.ROOT / "docs" / "others.md"
 IMAGES = results_page.ROOT / "docs" / "images"
 SPEC = {"runs": ["nav2d_dqn_target"], "reference": "abisim"}
 
@@ -38,7 +39,7 @@ def test_a_page_of_results_types_no_number_that_its_tables_and_commands_lack(pat
 
 def test_figures_are_drawn_from_the_tables_of_their_pages() -> None:
     shown, drawn = set(), []
-    for path in (RESULTS, APPENDIX):
+    for path in (RESULTS, APPENDIX, OTHERS):
         text = path.read_text()
         shown |= set(re.findall(r"\(images/comparison-(.*?)\.png\)", text))
         drawn += [spec["figure"] for match in results_page.TABLE.finditer(text)
