@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,23 @@ import torch as th
 from pretrain_inputs import make_run, run
 from ranks_inputs import DEATH, SETTINGS, gradients, objectives, pretrain_one, register, work
 
+from sb3_abisim import registry
 from sb3_abisim.data.collect import collect
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.pretraining.card import read_card
 from sb3_abisim.pretraining.ranks import Ranks, processes
 
 N_PROCESSES = 2
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> Iterator[None]:
+    """What a user would register, for these tests alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        for records in (registry._METHODS, registry._NETWORKS):
+            patch.setattr(records, "by_name", dict(records.by_name))
+        register()
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +45,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def folder(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What two processes made of every objective, and of a death."""
-    register()
     folder = tmp_path_factory.mktemp("ranks")
     run(data, folder / "base.safetensors", n_updates=2)
     context = multiprocessing.get_context("spawn")
@@ -47,7 +58,6 @@ def folder(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_objective_has_the_curve_of_one_process(data: Path, folder: Path) -> None:
-    register()
     assert "spread" in objectives() and len(objectives()) >= 8
     for objective in objectives():
         alone = read_card(pretrain_one(objective, data, folder / "one").with_suffix(".json"))["curves"]
@@ -68,7 +78,6 @@ def test_every_objective_has_the_curve_of_one_process(data: Path, folder: Path) 
 
 
 def test_gradients_are_those_of_one_process(data: Path, folder: Path) -> None:
-    register()
     for objective, several in th.load(folder / "gradients.pt", weights_only=True).items():
         alone = gradients(objective, data)
         assert several.keys() == alone.keys()
