@@ -94,6 +94,16 @@ def test_a_failed_write_names_the_file(tmp_path: Path) -> None:
     assert caught.value.errno == errno.ENOSPC
 
 
+def test_a_lock_that_cannot_be_written_names_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fill_the_disk(self: Path, *args: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", fill_the_disk)
+    with pytest.raises(OSError, match=rf"No space left on device: '.*{LOCK_NAME}'"), folder_lock(tmp_path):
+        pytest.fail("it was entered")
+    assert os.listdir(tmp_path) == []
+
+
 def test_full_disk_is_found_out_before_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int, offset: int, size: int) -> None:
         assert size == 3
