@@ -1,7 +1,6 @@
 """Exchange with Minari: lossless both ways, and nothing that a stranger's file names is run."""
 
 import builtins
-import io
 import json
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import gymnasium as gym
 import index_env  # noqa: F401  registers ids
 import numpy as np
 import pytest
-from PIL import Image
+from minari_inputs import episode, make_frames, make_minari
 
 from sb3_abisim.data import writer as writer_module
 from sb3_abisim.data.collect import collect
@@ -45,33 +44,6 @@ def assert_same_data(a: TransitionDataset, b: TransitionDataset) -> None:
         assert np.array_equal(other, values)
     assert a.meta["factors"] == b.meta["factors"]
     assert (a.observation_space, a.action_space) == (b.observation_space, b.action_space)
-
-
-def make_minari(dataset_id: str, episodes: list[dict], observation_space: gym.Space, **kwargs: object) -> None:
-    """A dataset written by somebody else."""
-    buffers = [minari.data_collector.EpisodeBuffer(**episode) for episode in episodes]
-    space = kwargs.pop("action_space", gym.spaces.Discrete(3))
-    with pytest.warns(UserWarning):
-        minari.create_dataset_from_buffers(
-            dataset_id, buffers, observation_space=observation_space, action_space=space, **kwargs
-        )
-
-
-def episode(frames: np.ndarray, terminated: bool = False, truncated: bool = False, **changes: object) -> dict:
-    n = len(frames) - 1
-    at_end = np.arange(n) == n - 1
-    return {
-        "observations": frames,
-        "actions": np.arange(n) % 3,
-        "rewards": np.ones(n),
-        "terminations": at_end & terminated,
-        "truncations": at_end & truncated,
-        "infos": {},
-    } | changes
-
-
-def make_frames(n: int, shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(256, size=(n, *shape), dtype=np.uint8)
 
 
 def test_round_trip_is_lossless(ours: Path, tmp_path: Path) -> None:
@@ -396,72 +368,3 @@ def test_missing_minari_names_the_command_that_installs_it(
         main(["export", str(ours), "index-v0"])
     assert exit_info.value.code == 2
     assert "pip install 'sb3_abisim[minari]'" in capsys.readouterr().err
-
-
-def data_file(dataset_id: str) -> Path:
-    return Path(minari.load_dataset(dataset_id).storage.data_path) / "main_data.hdf5"
-
-
-def damaged_minari(edit: object) -> None:
-    make_minari("a-v0", [episode(make_frames(9, (3, 9, 9)))], gym.spaces.Box(0, 255, (3, 9, 9), np.uint8))
-    with h5py.File(data_file("a-v0"), "a") as file:
-        edit(file["episode_0"])
-
-
-def huge(group: object) -> None:
-    del group["observations"]
-    group.create_dataset("observations", (10**9, 3, 9, 9), np.uint8, chunks=True)
-
-
-def elsewhere(group: object) -> None:
-    del group["actions"]
-    group["actions"] = h5py.ExternalLink("other.hdf5", "/actions")
-
-
-def in_another_file(group: object) -> None:
-    del group["actions"]
-    group.create_dataset("actions", (8,), np.int64, external=[("/etc/passwd", 0, 64)])
-
-
-def without_rewards(group: object) -> None:
-    del group["rewards"]
-
-
-def another_kind(group: object) -> None:
-    del group["actions"]
-    group.create_group("actions")
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (huge, r"main_data\.hdf5 is damaged .*/episode_0/observations declares 243000000000 bytes in 0"),
-        (elsewhere, "/episode_0/actions is a link"),
-        (in_another_file, "/episode_0/actions lies in another file"),
-        (without_rewards, "cannot be read .KeyError"),
-        (another_kind, "cannot be read .AssertionError"),
-    ],
-)
-def test_what_minari_would_fail_at_or_follow_is_one_sentence(tmp_path: Path, edit: object, message: str) -> None:
-    damaged_minari(edit)
-    with pytest.raises(ValueError, match=message):
-        import_dataset("a-v0", tmp_path / "out")
-
-
-def test_images_of_minari_are_jpeg_alone(tmp_path: Path) -> None:
-    """Pillow would start Ghostscript for an EPS."""
-    space = gym.spaces.Box(0, 255, (40, 48, 3), np.uint8)
-    make_minari("b-v0", [episode(make_frames(6, (40, 48, 3)))], space)
-    with pytest.warns(UserWarning, match="JPEG"):
-        import_dataset("b-v0", tmp_path / "jpeg")
-    eps = io.BytesIO()
-    Image.new("RGB", (48, 40)).save(eps, "EPS")
-    with h5py.File(data_file("b-v0"), "a") as file:
-        group = file["episode_0"]
-        del group["observations"]
-        group.create_dataset("observations", data=[np.frombuffer(eps.getvalue(), np.uint8)] * 6)
-    with (
-        pytest.warns(UserWarning, match="JPEG"),
-        pytest.raises(ValueError, match=r"cannot be read \(UnidentifiedImage"),
-    ):
-        import_dataset("b-v0", tmp_path / "out")
