@@ -70,7 +70,7 @@ ROWS: dict[str, tuple[dict[str, float], list[str]]] = {
     ]),
     "encoder files": ({"1 GiB": encoder_file.MAX_FILE_BYTES}, [
         "networks/test_encoder_file.py::test_a_file_of_the_largest_size_is_read",
-        "networks/test_encoder_file.py::test_a_network_that_is_not_registered_is_refused",
+        "networks/test_encoder_file_forged.py::test_a_network_that_is_not_registered_is_refused",
         "data/test_forged.py::test_networks_larger_than_their_file",
     ]),
     "checkpoints of pretraining": ({}, [
