@@ -21,6 +21,14 @@ def is_channels_first(shape: tuple[int, ...]) -> bool:
     return int(np.argmin(shape)) == 0
 
 
+def is_float_image_space(space: gym.Space[Any]) -> bool:
+    """Whether observations are images of floats between declared bounds, which no encoder takes as they are.
+
+    :param space: of observations
+    """
+    return isinstance(space, spaces.Box) and space.dtype.kind == "f" and len(space.shape) == 3 and space.is_bounded()
+
+
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
     """A space as JSON types; bounds of a ``Box`` that are the same everywhere become one number.
 

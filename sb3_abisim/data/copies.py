@@ -23,7 +23,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from sb3_abisim.common.images import fits
-from sb3_abisim.common.spaces import is_channels_first
+from sb3_abisim.common.spaces import is_channels_first, is_float_image_space
 
 MakeFn = Callable[[], gym.Env[Any, Any]]
 _WRAPPERS = (
@@ -94,7 +94,7 @@ class ImageLayout:
         elif image_key is not None:
             raise ValueError(f"image_key {image_key!r} chooses from a Dict of observations, got {space}; leave it out")
         if not _is_image(space):
-            if remedy == _WRAPPERS and _is_float_image(space):
+            if remedy == _WRAPPERS and is_float_image_space(space):
                 remedy = _FLOATS
             raise ValueError(
                 "observations must be uint8 images in 0..255 of shape (channels, height, width), (height, width, "
@@ -218,10 +218,6 @@ def factor_name(key: str) -> str:
     :param key: such as "observation.state"
     """
     return re.sub(r"\W|^(?=\d)", "_", key, flags=re.ASCII)
-
-
-def _is_float_image(space: gym.Space[Any]) -> bool:
-    return isinstance(space, spaces.Box) and space.dtype.kind == "f" and len(space.shape) == 3 and space.is_bounded()
 
 
 def _is_image(space: gym.Space[Any]) -> bool:

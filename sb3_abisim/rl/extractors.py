@@ -27,6 +27,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_abisim.common.images import ImageCheck
+from sb3_abisim.common.spaces import is_float_image_space
 from sb3_abisim.networks.base import Encoder, make_encoder
 from sb3_abisim.networks.encoder_file import EncoderFile, load_encoder
 from sb3_abisim.networks.encoder_name import EncoderNotFoundError
@@ -393,10 +394,18 @@ def _check_space(observation_space: gym.Space[Any]) -> None:
             f"an encoder takes one image, got {observation_space}; use CombinedEncoderExtractor with MultiInputPolicy"
         )
     if not is_image_space(observation_space):
-        raise ValueError(
-            f"an encoder takes uint8 images in 0..255, got {observation_space}; leave images unnormalized "
-            "(VecNormalize(norm_obs=False), in a zoo YAML no `normalize: true`), SB3 divides them by 255"
+        remedy = (
+            "leave images unnormalized (VecNormalize(norm_obs=False), in a zoo YAML no `normalize: true`), SB3 divides "
+            "them by 255"
         )
+        # What VecNormalize declares goes from -clip_obs to clip_obs.
+        if is_float_image_space(observation_space) and observation_space.low.min() >= 0:  # type: ignore[attr-defined]
+            remedy = (
+                "two wrappers make bytes of these floats, in a zoo YAML `env_wrapper: "
+                "[{gymnasium.wrappers.RescaleObservation: {min_obs: 0, max_obs: 255}}, "
+                "{gymnasium.wrappers.DtypeObservation: {dtype: uint8}}]`"
+            )
+        raise ValueError(f"an encoder takes uint8 images in 0..255, got {observation_space}; {remedy}")
 
 
 def __getattr__(name: str) -> Any:
