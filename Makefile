@@ -68,6 +68,7 @@ docs: setup  ## the pages of docs/ as a site with the API's reference, into site
 bench: setup  ## measure speed side by side with the alternatives, into benchmarks/results/
 	$(BIN)/python -m benchmarks.bench_envs
 	$(BIN)/python -m benchmarks.bench_pretraining
+	$(BIN)/python -m benchmarks.bench_ahead
 	$(BIN)/python -m benchmarks.bench_memory
 	$(BIN)/python -m benchmarks.bench_scale
 	$(BIN)/python -m benchmarks.bench_frozen

@@ -7,6 +7,7 @@ back, which happens now and then.
 
 import functools
 import os
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -97,6 +98,8 @@ class TransitionDataset:
         # Shard k holds the frames self._offsets[k] to self._offsets[k + 1] - 1.
         self._offsets = np.concatenate([[0], np.cumsum(frames_per_shard)]).astype(np.int64)
         self._files = ShardFiles(self.path, self.meta)
+        # Pretraining makes batches in one thread and evaluates in another; open files and renderers are shared.
+        self._lock = threading.Lock()
         n_shards = len(frames_per_shard)
         self._actions = np.concatenate([self._files.whole("actions", k) for k in range(n_shards)])
         self._ends = np.concatenate([self._files.whole("ends", k) for k in range(n_shards)])
@@ -286,7 +289,9 @@ class TransitionDataset:
 
     def _frames(self, index: NDArray[np.int64]) -> NDArray[np.uint8]:
         if self._render_fn is not None:
-            return self._render_fn(self._factors(index))
+            factors = self._factors(index)
+            with self._lock:
+                return self._render_fn(factors)
         if self.frame_stack == 1:
             return self._gather("frames", index)
         members = stack_members(index, self.frame_stack, self._ends, self._last, self._before)
@@ -308,7 +313,8 @@ class TransitionDataset:
         bounds = np.searchsorted(ascending, self._offsets)
         for shard in np.flatnonzero(np.diff(bounds)):
             here = slice(bounds[shard], bounds[shard + 1])
-            out[order[here]] = self._files.rows(name, int(shard), ascending[here] - self._offsets[shard])
+            with self._lock:
+                out[order[here]] = self._files.rows(name, int(shard), ascending[here] - self._offsets[shard])
         return out
 
     def _check_files(self, verify: bool | None) -> None:

@@ -138,6 +138,8 @@ class BatchEnv(gym.vector.VectorEnv):
     def render_factors(self, factors: dict[str, NDArray[Any]]) -> NDArray[np.uint8]:
         """The observations of states, equal to the bit to those at that time; changes nothing.
 
+        Called from any thread, by one at a time: pretraining renders a batch while it learns from another.
+
         :param factors: name to array of shape (n, ...), as of :meth:`factors`, at any time and in any copies
         :return: (n, *observation shape)
         :raises ValueError: for factors that this environment cannot have

@@ -1,7 +1,8 @@
 """The training loop of pretraining."""
 
+import contextlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from sb3_abisim.data.dataset import Split, TransitionDataset
 from sb3_abisim.networks.base import Encoder, make_encoder, preprocess, set_memory_format
 from sb3_abisim.networks.encoder_file import EncoderFileError, load_encoder, save_encoder
 from sb3_abisim.objectives.base import Objective, TensorBatch
+from sb3_abisim.pretraining.ahead import gains_from_ahead, make_ahead
 from sb3_abisim.pretraining.card import advice, make_card, warn_at_chance, write_card
 from sb3_abisim.pretraining.checkpoint import (
     Checkpoints,
@@ -188,19 +190,21 @@ class PretrainRun:
             mininterval=0.5,
         )
         try:
-            for batch in self._batches():
-                terms = self._update(batch)
-                for name, value in terms.items():
-                    sums[name] = sums.get(name, 0.0) + float(value)
-                bar.update()
-                if self.n_updates % self.config.log_interval and self.n_updates < self.config.n_updates:
-                    continue
-                with naming(self.folder):
-                    self._log(logger, sums)
-                sums = {}
-                # A checkpoint falls on a row of the log, so that no half-filled sums need saving.
-                if self.n_updates - self._saved_at >= self.config.checkpoint_interval:
-                    self.save()
+            asked_for = self._batches()
+            with contextlib.closing(make_ahead(asked_for) if gains_from_ahead(self.device) else asked_for) as batches:
+                for batch in batches:
+                    terms = self._update(batch)
+                    for name, value in terms.items():
+                        sums[name] = sums.get(name, 0.0) + float(value)
+                    bar.update()
+                    if self.n_updates % self.config.log_interval and self.n_updates < self.config.n_updates:
+                        continue
+                    with naming(self.folder):
+                        self._log(logger, sums)
+                    sums = {}
+                    # A checkpoint falls on a row of the log, so that no half-filled sums need saving.
+                    if self.n_updates - self._saved_at >= self.config.checkpoint_interval:
+                        self.save()
         finally:
             bar.close()
             with naming(self.folder):
@@ -280,16 +284,17 @@ class PretrainRun:
                     f"{self.folder}; try a smaller learning_rate and another output"
                 )
 
-    def _batches(self) -> Iterator[TensorBatch]:
+    def _batches(self) -> Generator[TensorBatch, None, None]:
         """The batches from the present position to the end; a position is (epoch, batch within it)."""
-        config = self.config
+        # Asked for ahead of the updates, so it keeps a count of its own.
+        config, n = self.config, self.n_updates
         per_epoch = len(self.dataset.pairs(config.k, "train")[0]) // config.batch_size
-        while self.n_updates < config.n_updates:
-            epoch, start = divmod(self.n_updates, per_epoch)
-            for batch in self._pass(config.batch_size, "train", epoch, start):
+        while n < config.n_updates:
+            epoch, start = divmod(n, per_epoch)
+            whole_pass = self._pass(config.batch_size, "train", epoch, start)
+            for batch in itertools.islice(whole_pass, config.n_updates - n):
+                n += 1
                 yield self._to_tensors(batch)
-                if self.n_updates >= config.n_updates:
-                    return
 
     def _pass(self, batch_size: int, split: Split, epoch: int = 0, start: int = 0) -> Iterator[TransitionBatch[Any]]:
         sequences = self.module.reads_action_sequences
