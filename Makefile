@@ -19,7 +19,7 @@ $(VENV)/.installed: setup.cfg constraints.txt
 
 setup: $(VENV)/.installed  ## make .venv and install the package with its pinned dependencies
 
-demo: setup  ## collect, pretrain, train PPO, draw: the whole product in about ten minutes, into demo/
+demo: setup  ## collect, pretrain, train PPO, draw: the whole product in about three minutes, into demo/
 	$(BIN)/sb3-abisim demo -o demo
 
 # In random order, over all processors, with one thread each.

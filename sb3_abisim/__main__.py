@@ -27,7 +27,7 @@ COMMANDS = {
     "benchmark": ("sb3_abisim.benchmark.command", "compare methods over environments and seeds, and report"),
     "zoo": ("sb3_abisim.zoo.command", "any other command of rl-zoo3, such as record_video or all_plots"),
     "doctor": ("sb3_abisim.doctor", "say what is installed, or what is inside a file and whether it loads here"),
-    "demo": ("sb3_abisim.demo", "the whole way in ten minutes: collect, pretrain, train, record"),
+    "demo": ("sb3_abisim.demo", "the whole way in three minutes: collect, pretrain, train, record"),
 }
 
 
