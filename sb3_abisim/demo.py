@@ -1,8 +1,8 @@
 """From data to a trained agent in about three minutes on two cores: ``sb3-abisim demo -o demo``.
 
 Runs the commands that a user would type, prints each before it starts, and ends with a learning curve, a GIF of the
-trained agent and the folder where everything lies. The method is the one whose frozen encoder PPO learns on the fastest,
-goal progress. The budget is far below that of the shipped encoders: it shows the steps, no result.
+trained agent and the folder where everything lies. The method, goal progress, is the one on whose frozen encoder PPO
+learns the fastest. The budget is far below that of the shipped encoders: it shows the steps, no result.
 """
 
 import argparse

@@ -15,7 +15,8 @@ def test_demo_leaves_a_curve_a_gif_and_a_run(tmp_path, capfd):
     for name in ("data/meta.json", "ssi.safetensors", "goal_progress.safetensors", "learning_curve.png", "agent.gif"):
         assert (tmp_path / name).is_file(), name
     assert str(tmp_path) in out and "learning curve" in out
-    assert "source " + str(tmp_path / "goal_progress.safetensors") in out, "PPO must train on the encoder that was just made"
+    source = str(tmp_path / "goal_progress.safetensors")
+    assert f"source {source}" in out, "PPO must train on the encoder that was just made"
     run = newest_run(tmp_path)
     assert (run / "DistractorPointMaze-v0.zip").is_file()
     with Image.open(tmp_path / "agent.gif") as gif:
