@@ -84,9 +84,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     parser = make_parser("demo", "From data to a trained agent in about ten minutes on two cores.", "demo -o demo")
     parser.add_argument("-o", "--output", default="demo", metavar="DIR", help="folder for everything (default: demo)")
-    parser.add_argument("--n-transitions", type=int, default=50_000)
-    parser.add_argument("--n-updates", type=int, default=2_000)
-    parser.add_argument("--n-timesteps", type=int, default=250_000)
+    parser.add_argument("--n-transitions", type=int, default=50_000, help="to pretrain on (default: %(default)s)")
+    parser.add_argument("--n-updates", type=int, default=2_000, help="of pretraining (default: %(default)s)")
+    parser.add_argument("--n-timesteps", type=int, default=250_000, help="of PPO (default: %(default)s)")
     run(parser, argv, _command)
 
 

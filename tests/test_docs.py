@@ -57,7 +57,7 @@ def test_every_method_has_a_page_with_idea_equation_code_command_and_numbers(nam
     page = (ROOT / "docs" / "objectives" / f"{name}.md").read_text(encoding="utf-8")
     parts = ["**What.**", "**Equation", "**Source.**", "**Run.**", "**Numbers.**"]
     places = [page.find(part) for part in parts]
-    assert -1 not in places and places == sorted(places), dict(zip(parts, places))
+    assert -1 not in places and places == sorted(places), dict(zip(parts, places, strict=True))
     command = page[places[3] : places[4]]
     assert re.search(rf"^    sb3-abisim train .*--conf-file {name}\b", command, re.MULTILINE), command
     assert re.search(r"<!-- table\n.*?-->\n\n\|", page[places[4] :], re.DOTALL), "a table of benchmarks.results_page"
