@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import sb3_abisim
-from sb3_abisim.registry import methods
+from sb3_abisim.registry import Method, methods
 from tools.make_environments_page import page as environments_page
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -64,6 +64,19 @@ def test_every_method_has_a_page_with_idea_equation_code_command_and_numbers(nam
     for index in ("README.md", "docs/objectives/README.md"):
         link = f"{'docs/objectives/' if index == 'README.md' else ''}{name}.md"
         assert f"]({link})" in (ROOT / index).read_text(encoding="utf-8"), index
+
+
+@pytest.mark.parametrize("method", list(methods().values()), ids=lambda method: method.name)
+def test_the_pages_on_extractors_and_on_the_zoo_name_every_method(method: Method) -> None:
+    assert f"`{method.extractor}`" in (ROOT / "docs" / "encoders.md").read_text(encoding="utf-8")
+    if not method.trained_elsewhere:
+        zoo = (
+            (ROOT / "docs" / "zoo.md")
+            .read_text(encoding="utf-8")
+            .partition("| `--conf-file` |")[2]
+            .partition("\n\n")[0]
+        )
+        assert re.search(rf"^\|.*`{method.name}`", zoo, re.MULTILINE)
 
 
 def test_the_page_of_environments_says_what_they_and_the_results_say() -> None:
