@@ -100,7 +100,7 @@ def _command(args: argparse.Namespace) -> None:
         subprocess.run([sys.executable, "-m", *words], check=True)
     zoo_run = newest_run(folder)
     plot_learning_curve(zoo_run, folder / "learning_curve.png")
-    success = record(zoo_run, folder / "agent.gif")
+    success = record(zoo_run, folder / "agent.gif").success
     minutes = (time.monotonic() - start) / 60
     print(f"\nDone in {minutes:.1f} minutes; the agent reached the goal in {success:.0%} of the recorded episodes.")
     print(f"  learning curve    {folder / 'learning_curve.png'}")
