@@ -85,9 +85,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     parser = make_parser("demo", "From data to a trained agent in about three minutes on two cores.", "demo -o demo")
     parser.add_argument("-o", "--output", default="demo", metavar="DIR", help="folder for everything (default: demo)")
-    parser.add_argument("--n-transitions", type=int, default=50_000)
-    parser.add_argument("--n-updates", type=int, default=600)
-    parser.add_argument("--n-timesteps", type=int, default=65_536)
+    parser.add_argument("--n-transitions", type=int, default=50_000, help="to pretrain on (default: %(default)s)")
+    parser.add_argument("--n-updates", type=int, default=600, help="of pretraining (default: %(default)s)")
+    parser.add_argument("--n-timesteps", type=int, default=65_536, help="of PPO (default: %(default)s)")
     run(parser, argv, _command)
 
 
@@ -101,7 +101,7 @@ def _command(args: argparse.Namespace) -> None:
         subprocess.run([sys.executable, "-m", *words], check=True)
     zoo_run = newest_run(folder)
     plot_learning_curve(zoo_run, folder / "learning_curve.png")
-    success = record(zoo_run, folder / "agent.gif")
+    success = record(zoo_run, folder / "agent.gif").success
     minutes = (time.monotonic() - start) / 60
     print(f"\nDone in {minutes:.1f} minutes; the agent reached the goal in {success:.0%} of the recorded episodes.")
     print(f"  learning curve    {folder / 'learning_curve.png'}")

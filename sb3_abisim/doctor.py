@@ -68,6 +68,7 @@ def encoder_lines(name: str) -> Iterator[Line]:
 
     :param name: as for ``load_encoder``
     """
+    from sb3_abisim.common.spaces import space_from_json
     from sb3_abisim.networks.encoder_file import load_encoder
 
     file = load_encoder(name)
@@ -77,7 +78,8 @@ def encoder_lines(name: str) -> Iterator[Line]:
     yield _fact("method", f"{metadata['objective']}, {metadata['settings'].get('n_updates', '?')} updates")
     yield _fact("environment", f"{metadata['env_id']} {metadata['env_kwargs'] or ''}")
     yield _fact("observations", f"{metadata['observation_space']['shape']}, uint8, channels first")
-    yield _fact("actions", str(metadata["action_space"] or "any"))
+    actions = metadata["action_space"]
+    yield _fact("actions", "any" if actions is None else str(space_from_json(actions)))
     yield _fact("preprocessing", str(metadata["preprocessing"] or "none"))
     parameters = sum(weights.numel() for weights in file.encoder.parameters())
     yield _fact("network", f"{spec['name']} {spec['kwargs'] or ''}, {parameters} weights")
@@ -98,7 +100,8 @@ def dataset_lines(folder: Path) -> Iterator[Line]:
     yield _fact("dataset", str(folder))
     yield _fact("hash", dataset.hash)
     yield _fact("environment", f"{dataset.env_id} {dataset.env_kwargs or ''}")
-    yield _fact("transitions", f"{dataset.n_transitions} in {len(dataset.meta['shards'])} shards")
+    n_shards = len(dataset.meta["shards"])
+    yield _fact("transitions", f"{dataset.n_transitions} in {n_shards} shard{'s' * (n_shards != 1)}")
     yield _fact("observations", str(dataset.observation_space))
     yield _fact("actions", str(dataset.action_space))
     yield _fact("preprocessing", str(dataset.preprocessing or "none"))
@@ -142,11 +145,14 @@ def model_lines(path: Path) -> Iterator[Line]:
 
     data, policy = read_weights(path)
     yield _fact("model", f"{path}, {data.get('num_timesteps', '?')} steps")
-    yield _fact("policy", f"{len(policy)} tensors of {sum(weights.numel() for weights in policy.values())} numbers")
+    yield _fact(
+        "policy", f"{len(policy)} tensors, {sum(weights.numel() for weights in policy.values())} numbers in all"
+    )
     # Beside a pickle, Stable-Baselines3 keeps what it stands for as texts.
     kwargs = data.get("policy_kwargs")
     extractor = kwargs.get("features_extractor_class") if isinstance(kwargs, dict) else None
-    yield _fact("features extractor", str(extractor or "Stable-Baselines3's default"))
+    named = re.fullmatch(r"<class '(.*)'>", str(extractor))
+    yield _fact("features extractor", named[1] if named else str(extractor or "Stable-Baselines3's default"))
     hashes = {
         bytes(value.tolist()).hex()
         for name, value in policy.items()

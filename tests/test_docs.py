@@ -11,7 +11,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import sb3_abisim
-from sb3_abisim.registry import methods
+from sb3_abisim.registry import Method, methods
 from tools.make_environments_page import page as environments_page
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,6 +50,33 @@ def test_links_of_a_page_lead_somewhere_in_the_repository(page: str) -> None:
         assert target.is_relative_to(ROOT) and target.is_file(), f"{page}: {link.geturl()}"
         if link.fragment:
             assert link.fragment in anchors(target.read_text(encoding="utf-8")), f"{page}: {link.geturl()}"
+
+
+@pytest.mark.parametrize("name", [name for name, method in methods().items() if not method.trained_elsewhere])
+def test_every_method_has_a_page_with_idea_equation_code_command_and_numbers(name: str) -> None:
+    page = (ROOT / "docs" / "objectives" / f"{name}.md").read_text(encoding="utf-8")
+    parts = ["**What.**", "**Equation", "**Source.**", "**Run.**", "**Numbers.**"]
+    places = [page.find(part) for part in parts]
+    assert -1 not in places and places == sorted(places), dict(zip(parts, places, strict=True))
+    command = page[places[3] : places[4]]
+    assert re.search(rf"^    sb3-abisim train .*--conf-file {name}\b", command, re.MULTILINE), command
+    assert re.search(r"<!-- table\n.*?-->\n\n\|", page[places[4] :], re.DOTALL), "a table of benchmarks.results_page"
+    for index in ("README.md", "docs/objectives/README.md"):
+        link = f"{'docs/objectives/' if index == 'README.md' else ''}{name}.md"
+        assert f"]({link})" in (ROOT / index).read_text(encoding="utf-8"), index
+
+
+@pytest.mark.parametrize("method", list(methods().values()), ids=lambda method: method.name)
+def test_the_pages_on_extractors_and_on_the_zoo_name_every_method(method: Method) -> None:
+    assert f"`{method.extractor}`" in (ROOT / "docs" / "encoders.md").read_text(encoding="utf-8")
+    if not method.trained_elsewhere:
+        zoo = (
+            (ROOT / "docs" / "zoo.md")
+            .read_text(encoding="utf-8")
+            .partition("| `--conf-file` |")[2]
+            .partition("\n\n")[0]
+        )
+        assert re.search(rf"^\|.*`{method.name}`", zoo, re.MULTILINE)
 
 
 def test_the_page_of_environments_says_what_they_and_the_results_say() -> None:

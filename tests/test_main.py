@@ -9,6 +9,7 @@ import pytest
 
 from sb3_abisim import __version__
 from sb3_abisim.__main__ import COMMANDS, main, usage
+from sb3_abisim.registry import methods
 
 # What takes long to import, and is not needed to answer --help.
 HEAVY = ("torch", "stable_baselines3", "rl_zoo3", "matplotlib", "pandas", "scipy", "mujoco")
@@ -38,6 +39,15 @@ def test_every_command_has_help_with_an_example(command: str, capsys: pytest.Cap
     assert f"example: sb3-abisim {command} " in out
     # rl-zoo3 has its own word for it, which `train --help` and `enjoy --help` name.
     assert "--packages" in out or command == "zoo"
+
+
+def test_help_names_every_objective(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["pretrain", "--help"])
+    out = capsys.readouterr().out
+    assert not [
+        name for name, method in methods().items() if method.is_pretrained and not re.search(rf"\b{name}\b", out)
+    ]
 
 
 def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:

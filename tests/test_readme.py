@@ -61,6 +61,15 @@ def test_its_three_commands_run(tmp_path: Path) -> None:
     assert (tmp_path / "logs" / "ppo" / "Nav2D-v0_1" / "Nav2D-v0.zip").is_file()
 
 
+def test_an_agent_is_trained_and_recorded_by_its_first_commands(tmp_path: Path) -> None:
+    lines = re.findall(r"^ {4}sb3-abisim ((?:train|record) .*DistractorPointMaze-v0.*)$", README, re.MULTILINE)
+    assert [line.split()[0] for line in lines] == ["train", "record"]
+    run(["-m", "sb3_abisim", *shlex.split(lines[0].replace("40960", "64").replace("128", "32"))], tmp_path)
+    run(["-m", "sb3_abisim", *shlex.split(lines[1]), "--episodes", "1"], tmp_path)
+    assert (tmp_path / "agent.gif").is_file()
+    assert lines[0] in (ROOT / "docs" / "quickstart.md").read_text(encoding="utf-8")
+
+
 def test_its_python_runs(tmp_path: Path) -> None:
     (block,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert len([line for line in block.splitlines() if line]) <= 12

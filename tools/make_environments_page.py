@@ -45,13 +45,23 @@ docstrings and the committed results.
     env = gym.make("PointMaze-v0")
     batch = gym.make_vec("PointMaze-v0", num_envs=64, vectorization_mode="vector_entry_point")
 
+| id | | observation | actions | steps |
+|---|---|---|---|---:|
+{spaces}
+
+Which file fits an environment, and what is in it: [shipped encoders](../encoders/README.md).
+
+## Returns
+
 "Random" is the mean return of uniformly random actions, with half its 95 % interval, over {n_episodes} episodes
 ([random_agent.json](../benchmarks/results/random_agent.json)). "Best" is the highest mean final return of a method in
-the committed comparisons, of the stochastic policy over three runs or more; distractors are those of the split `eval`.
-It is the best of many and therefore somewhat too high. An empty place means that no committed result has it.
+the committed comparisons, of the stochastic policy over three runs or more. Distractor environments show clips there
+that training never showed. "Best" is the best of many and therefore somewhat too high. An empty place means that no
+committed result has it.
 
-| id | | observation | actions | steps | returns | random | best |
-|---|---|---|---|---:|---|---:|---|
+| id | possible | random | best |
+|---|---|---:|---|
+{returns}
 """
 SPECIFICATIONS = (
     ("Nav2D", "nav2d"),
@@ -145,11 +155,22 @@ def space_words(space: gym.Space[Any]) -> str:
     return f"`{space}`"
 
 
-def rows() -> Iterator[str]:
+def space_rows() -> Iterator[str]:
     """Of the table of ids."""
-    random, best = json.loads(RANDOM.read_text(encoding="utf-8"))["returns"], best_returns()
     for env_id in ENV_IDS:
         env = gym.make(env_id)
+        image = f"![{env_id}](images/environments/{SAME_IMAGE.get(env_id, env_id)}.gif)"
+        yield (
+            f"| `{env_id}` | {image} | {space_words(env.observation_space)} | {space_words(env.action_space)} | "
+            f"{env.spec.max_episode_steps} |"
+        )
+        env.close()
+
+
+def return_rows() -> Iterator[str]:
+    """Of the table of returns."""
+    random, best = json.loads(RANDOM.read_text(encoding="utf-8"))["returns"], best_returns()
+    for env_id in ENV_IDS:
         traits = get_traits(env_id)
         low, high = traits.return_range or (None, None)
         returns = "" if low is None else f"{low:g} to {high:g}"
@@ -159,12 +180,7 @@ def rows() -> Iterator[str]:
         if env_id in best:
             mean, n_runs, method, folder = best[env_id]
             reached = f"{mean:.1f}, {n_runs} runs of `{method}` ([{folder}](../{COMPARISONS}/{folder}/benchmark.json))"
-        image = f"![{env_id}](images/environments/{SAME_IMAGE.get(env_id, env_id)}.gif)"
-        yield (
-            f"| `{env_id}` | {image} | {space_words(env.observation_space)} | {space_words(env.action_space)} | "
-            f"{env.spec.max_episode_steps} | {returns} | {by_chance} | {reached} |"
-        )
-        env.close()
+        yield f"| `{env_id}` | {returns} | {by_chance} | {reached} |"
 
 
 def in_markdown(docstring: str) -> str:
@@ -182,7 +198,8 @@ def in_markdown(docstring: str) -> str:
 
 def page() -> str:
     """The whole text."""
-    text = HEAD.format(n_episodes=json.loads(RANDOM.read_text(encoding="utf-8"))["episodes"]) + "\n".join(rows()) + "\n"
+    n_episodes = json.loads(RANDOM.read_text(encoding="utf-8"))["episodes"]
+    text = HEAD.format(n_episodes=n_episodes, spaces="\n".join(space_rows()), returns="\n".join(return_rows()))
     for name, module in SPECIFICATIONS:
         made = import_module(f"sb3_abisim.envs.{module}")
         docstring = inspect.getdoc(getattr(made, f"{name}VectorEnv")) or ""

@@ -261,7 +261,7 @@ def _trained(args: argparse.Namespace) -> Path:
 _Run = Callable[[argparse.Namespace], None]
 # Name: what it does, its parser and its function.
 COMMANDS: dict[str, tuple[str, Callable[[str], argparse.ArgumentParser], _Run]] = {
-    "exact": ("compare encoders of Nav2D with the exact metric", _exact_parser, _exact),
+    "exact": ("compare encoders of Nav2D with the action-bisimulation metric, solved exactly", _exact_parser, _exact),
     "readouts": ("what an agent needs on Nav2D, read from embeddings", _readouts_parser, _readouts),
     **{name: (one.help, _figure_parser, _figure) for name, one in FIGURES.items()},
     "sweep": ("perturbation maps on Nav2D over c, beside those of the exact metric", _sweep_parser, _sweep),

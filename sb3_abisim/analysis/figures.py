@@ -82,11 +82,11 @@ FIGURES = {
     ),
     "curves": Figure(
         "pretraining curves, from the model cards",
-        ("DistractorPointMaze-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "Nav2D-v0"), 1, "unused",
+        ("DistractorPointMaze-v0", "PointMaze-v0", "ContinuousPointMaze-v0", "Nav2D-v0"), 1, "changes nothing here",
         lambda files, env_id, size: curves.curves(files), plots_pixels.plot_curves, as_pretrained=True,
     ),
     "leak": Figure(
-        "can the action be read from a few pixels?", ("DistractorPointMaze-v0", "Nav2D-v0"), 300, "episodes",
+        "whether the action can be read from a few pixels", ("DistractorPointMaze-v0", "Nav2D-v0"), 300, "episodes",
         lambda files, env_id, size: leak.leak_maps(env_id, size), plots_pixels.plot_leak, encoders=False,
         of_data=leak.leak_maps_of_data,
     ),

@@ -82,10 +82,11 @@ def _add_budget(parser: argparse.ArgumentParser) -> None:
                         help="settings of pretraining, such as abisim.objective_kwargs.c:0.9")  # fmt: skip
     parser.add_argument("--image-key", metavar="KEY",
                         help="which image of a Dict of observations to pretrain on")  # fmt: skip
-    parser.add_argument("--device", default="auto")
+    parser.add_argument("--device", default="auto", help="as in Stable-Baselines3 (default: auto)")
     parser.add_argument("--threads", type=int, default=1, help="of each job (default: 1)")
     parser.add_argument("--jobs", type=int, help="jobs at a time (default: as the processors allow)")
-    parser.add_argument("--engine", default="local", choices=("local", "ray"))
+    parser.add_argument("--engine", default="local", choices=("local", "ray"),
+                        help="where jobs run: on this machine, or on a Ray cluster (default: local)")  # fmt: skip
     parser.add_argument("--address", default="auto", help="of the Ray cluster (default: auto)")
     parser.add_argument("--gpus", type=float, default=0.0, help="per job, on Ray (default: 0)")
     parser.add_argument("--retries", type=int, default=3, help="after a lost worker, on Ray (default: 3)")
@@ -241,11 +242,11 @@ def _sweep_parser() -> argparse.ArgumentParser:
     parser.add_argument("--space", required=True, nargs="+", metavar="NAME=VALUES",
                         help="what to search: objective_kwargs.c=0.5..0.99 learning_rate=1e-4..1e-3:log "
                         "objective_kwargs.pairs=random|nearest; ssi.NAME=VALUES for the base's")  # fmt: skip
-    parser.add_argument("--n-trials", type=int, default=20, help="(default: 20)")
+    parser.add_argument("--n-trials", type=int, default=20, help="settings to try (default: 20)")
     parser.add_argument("--batch", type=int, default=1, help="trials proposed at a time (default: 1)")
     parser.add_argument("--metric", choices=("final", "area"), default="final",
                         help="return of the last three evaluations, or of all of them (default: final)")  # fmt: skip
-    parser.add_argument("--sampler-seed", type=int, default=0)
+    parser.add_argument("--sampler-seed", type=int, default=0, help="of the settings that are proposed (default: 0)")
     _add_budget(parser)
     return parser
 

@@ -231,6 +231,13 @@ def read_env_id(data: Path) -> str:
         ) from error
 
 
+# The built-in ones by hand: to ask the registry would import PyTorch for --help.
+OBJECTIVE_HELP = (
+    "what the encoder is trained by: abisim (action-bisimulation), ssi, acro, info_nce (they predict actions), "
+    "goal_progress (values of goals), curl, beta_vae (observations alone), or one that --packages registers"
+)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """The command; see ``--help``.
 
@@ -241,7 +248,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         "Pretrain an encoder on a dataset. Killed at any moment, the same command goes on from its last checkpoint.",
         "pretrain --objective abisim --data data/pointmaze -o my/abisim.safetensors",
     )
-    parser.add_argument("--objective", required=True, metavar="METHOD", help="such as ssi or abisim")
+    parser.add_argument("--objective", required=True, metavar="METHOD", help=OBJECTIVE_HELP)
     parser.add_argument("--env", metavar="ID", help="refuse data of another environment than this")
     parser.add_argument("--data", required=True, metavar="DIR", help="a dataset's folder")
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="encoder file (.safetensors)")

@@ -9,12 +9,14 @@ import numpy as np
 
 from sb3_abisim.common.cli import PROGRAM
 from sb3_abisim.common.extras import needs_extra
+from sb3_abisim.common.spaces import space_from_json
 from sb3_abisim.common.text import printable
 from sb3_abisim.networks.encoder_file import EncoderFile
 from sb3_abisim.networks.encoder_name import HUB_PREFIX
 from sb3_abisim.pretraining.card import read_card
 from sb3_abisim.push.evidence import Evidence, Result
 from sb3_abisim.push.markdown import code_block, inert, table
+from sb3_abisim.registry import methods
 
 LIBRARY = "stable-baselines3"
 TAGS = ("reinforcement-learning", "deep-reinforcement-learning", "representation-learning", LIBRARY, "sb3_abisim")
@@ -41,6 +43,8 @@ def make_card(file: EncoderFile, repo_id: str, license: str | None, evidence: Se
             task_type=result.task,
             dataset_type=printable(result.env_id),
             dataset_name=printable(f"{result.env_id}, {result.split}"),
+            # Results of one type, config and split share the name of the first.
+            dataset_split=printable(result.split),
             metric_type=result.metric,
             metric_name=printable(result.name),
             metric_value=round(result.value, 4),
@@ -83,7 +87,8 @@ def _use(file: EncoderFile, repo_id: str) -> Lines:
         f"# {inert(objective)} encoder for {inert(env_id)}",
         "",
         "A visual encoder for [Stable-Baselines3](https://stable-baselines3.readthedocs.io), pretrained without "
-        f"rewards with `sb3_abisim`. It turns an observation into {file.encoder.features_dim} numbers for the policy.",
+        f"rewards with `sb3_abisim`{_label(objective)}. It turns an observation into {file.encoder.features_dim} "
+        "numbers for the policy.",
         "",
         "## Use",
         "",
@@ -113,13 +118,19 @@ def _use(file: EncoderFile, repo_id: str) -> Lines:
     ]
 
 
+def _label(objective: str) -> str:
+    """What the method of an encoder is called, where it is registered."""
+    method = methods().get(objective)
+    return "" if method is None or method.label == objective else f" by {inert(method.label)}"
+
+
 def _content(file: EncoderFile) -> Lines:
     metadata, spec = file.metadata, file.encoder.spec()
     rows = {
         "environment": f"{metadata['env_id']} {metadata['env_kwargs'] or ''}",
         "observations": f"uint8, channels first, {metadata['observation_space']['shape']}",
         "preprocessing": metadata["preprocessing"] or "none",
-        "actions": metadata["action_space"] or "any",
+        "actions": space_from_json(metadata["action_space"]) if metadata["action_space"] else "any",
         "network": f"{spec['name']} {spec['kwargs'] or ''}",
         "weights": sum(weights.numel() for weights in file.encoder.parameters()),
         "features": file.encoder.features_dim,

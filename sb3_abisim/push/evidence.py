@@ -88,7 +88,9 @@ def benchmark_evidence(file: EncoderFile, folder: str) -> Evidence:
         "## Reinforcement learning",
         "",
         "Mean return of the final models, with the half width of the 95 % interval over runs (Student's t). Bold: runs "
-        "with this file, or with one of several encoder files of the same method. Other rows are for comparison.",
+        "with this file, or with one of several encoder files of the same method. Other rows are for comparison. "
+        "Splits are the environment's, such as `eval` for what training never showed. `frozen` methods leave the "
+        "encoder as it is; the others fine-tune it.",
         "",
         *table(["environment", "method", "policy and split", "return", "runs", "encoder files"], rows),
         *_curves(comparison, ours),
@@ -152,7 +154,9 @@ def probes_evidence(file: EncoderFile, path: str) -> Evidence:
     section = [
         "## What can be read from it",
         "",
-        f"Probes in {inert(env_id)}: R² for numbers, area under the ROC curve for yes and no, accuracy for classes.",
+        f"Probes in {inert(env_id)}: a regression (linear) and a small network (MLP) read parts of the simulator's "
+        "state, the factors, from the encoder's numbers. Scores are R² for numbers, the area under the ROC curve "
+        "for yes and no, and accuracy for classes.",
         "",
         *table(
             ["split", "factor", "probe", "score"],

@@ -61,6 +61,9 @@ def main(argv: Sequence[str]) -> None:
     if {"-h", "--help"} & set(flags):
         if command == "train":
             print(f"rl-zoo3's train; --conf-file also takes {grammar()}.")
+            print(
+                "Without =ENCODER, it is the one that ships for the environment; frozen keeps its weights as they are."
+            )
             print(f"{_AUXILIARY} {GRAMMAR} trains the encoder by an objective, too: --auxiliary abisim:weight=0.5.")
             print(
                 f"{_IMAGE_KEY} KEY: the image that the method is for, of a Dict of observations (default: the file's)."

@@ -6,7 +6,7 @@ rl-zoo3's ``record_video`` makes an MP4. A GIF plays in a README and in any brow
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +30,20 @@ PIXELS = 192
 MAX_FRAMES = 128
 
 
-def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: int = 0, trust: bool = False) -> float:
+class Recording(NamedTuple):
+    """What was recorded.
+
+    :param mean_return: of the episodes, as the environment gives rewards
+    :param success: share of the episodes that were successful; None where the environment does not say
+    """
+
+    mean_return: float
+    success: float | None
+
+
+def record(
+    run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: int = 0, trust: bool = False
+) -> Recording:
     """Record the final model of a run, in its environment, on the evaluation split where there are splits.
 
     The policy is stochastic: a deterministic one can get stuck at a corner.
@@ -40,7 +53,7 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
     :param n_episodes: at least 1
     :param seed: of the episodes and of the actions
     :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
-    :return: share of the recorded episodes that were successful
+    :return: how the episodes went
     :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
     """
     from stable_baselines3.common.utils import set_random_seed
@@ -54,7 +67,7 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
     env = make_run_env(zoo_run, model, 1, {**kwargs, "render_mode": "rgb_array"}, seed, camera.watch)
     set_random_seed(seed)
     frames: list[Image.Image] = []
-    successes = 0
+    returns, successes = list[float](), list[bool]()
     try:
         for episode in range(n_episodes):
             env.seed(seed + episode)
@@ -65,14 +78,16 @@ def record(run_folder: str | Path, path: str | Path, n_episodes: int = 4, seed: 
             while "episode" not in info:
                 action, state = model.predict(observation, state, started, deterministic=False)
                 observation, _, started, (info,) = env.step(action)
-            successes += bool(info.get("is_success", False))
+            returns.append(float(info["episode"]["r"]))
+            if "is_success" in info:
+                successes.append(bool(info["is_success"]))
             shown = camera.last_episode
             frames += shown[:: -(-len(shown) // MAX_FRAMES)] + [shown[-1]] * (N_LAST - 1)
     finally:
         env.close()
     rest = {"save_all": True, "append_images": frames[1:], "duration": MILLISECONDS, "loop": 0}
     write_atomic(Path(path), lambda file: frames[0].save(file, format="GIF", **rest))
-    return successes / n_episodes
+    return Recording(float(np.mean(returns)), float(np.mean(successes)) if successes else None)
 
 
 class _Camera:
@@ -142,5 +157,6 @@ def _command(args: argparse.Namespace) -> None:
     require_extra("plots", "a GIF", "PIL")
     if not args.output.absolute().parent.is_dir():
         raise ValueError(f"there is no folder {args.output.parent} for {args.output.name}; make it first")
-    success = record(args.run, args.output, args.episodes, args.seed, args.trust)
-    print(f"Wrote {args.output}; {success:.0%} of its {args.episodes} episodes were successful")
+    mean_return, success = record(args.run, args.output, args.episodes, args.seed, args.trust)
+    successful = "" if success is None else f", {success:.0%} successful"
+    print(f"Wrote {args.output}; episodes: {args.episodes}, mean return {mean_return:.4g}{successful}")

@@ -78,6 +78,19 @@ def test_huggingface_reads_the_card(file: EncoderFile, tmp_path: Path) -> None:
     assert len(results) == 2 + 3
 
 
+def test_results_of_each_split_keep_their_split(file: EncoderFile, tmp_path: Path) -> None:
+    scores = {split: {"agent": {"linear": score}} for split, score in (("train clips", 0.75), ("eval clips", 0.5))}
+    probes = {"env_id": "Nav2D-v0", "encoders": {"a": {"hash": file.hash, "scores": scores}}}
+    (tmp_path / "p.json").write_text(json.dumps(probes))
+    evidence = [probes_evidence(file, str(tmp_path / "p.json"))]
+    results = ModelCard(make_card(file, "me/enc", None, evidence)).data.eval_results
+    found = {result.dataset_name: (result.dataset_split, result.metric_value) for result in results}
+    assert found == {
+        "Nav2D-v0, train clips": ("train clips", 0.75),
+        "Nav2D-v0, eval clips": ("eval clips", 0.5),
+    }
+
+
 def test_the_text_says_how_to_use_it_and_what_it_gained(file: EncoderFile, tmp_path: Path) -> None:
     runs, probes = write_runs(tmp_path / "runs", file.hash), write_probes(tmp_path / "p.json", file.hash)
     evidence = [benchmark_evidence(file, str(runs)), probes_evidence(file, str(probes))]

@@ -45,9 +45,10 @@ def test_every_step_is_shown_and_each_end_stays_for_a_second(run_folder, tmp_pat
     # Right and left in turns: no two neighboring frames are alike, unless the agent stands between walls.
     turns = iter([2, 3] * 100)
     monkeypatch.setattr(PPO, "predict", lambda *args, **kwargs: (np.array([next(turns)]), None))
-    success = record(run_folder, tmp_path / "a.gif", n_episodes=2, seed=3)
+    mean_return, success = record(run_folder, tmp_path / "a.gif", n_episodes=2, seed=3)
     shown = frames(tmp_path / "a.gif")
-    assert success in (0.0, 0.5, 1.0)
+    # Nine steps, each of which costs one.
+    assert success in (0.0, 0.5, 1.0) and mean_return == -9 + success
     # Ten frames for nine steps, with the run's time limit; the last one stays.
     assert sum(duration for duration, _ in shown) == 2 * (10 + N_LAST - 1) * MILLISECONDS
     assert sum(duration >= N_LAST * MILLISECONDS for duration, _ in shown) == 2
@@ -60,14 +61,16 @@ def test_of_a_long_episode_some_frames_are_left_out(run_folder, tmp_path, monkey
     assert sum(duration for duration, _ in frames(tmp_path / "a.gif")) == (4 + N_LAST - 1) * MILLISECONDS
 
 
-def test_an_environment_that_knows_no_success(run_folder, tmp_path, monkeypatch):
+def test_an_environment_that_knows_no_success(run_folder, tmp_path, monkeypatch, capsys):
     class Silent(gym.Wrapper):
         def step(self, action):
             return (*super().step(action)[:4], {})
 
     plain = gym.make
     monkeypatch.setattr(gym, "make", lambda *args, **kwargs: Silent(plain(*args, **kwargs)))
-    assert record(run_folder, tmp_path / "a.gif", n_episodes=1) == 0.0
+    module.main([str(run_folder), "-o", str(tmp_path / "a.gif"), "--episodes", "1"])
+    said = capsys.readouterr().out
+    assert "episodes: 1, mean return -9" in said and "successful" not in said
     assert (tmp_path / "a.gif").is_file()
 
 

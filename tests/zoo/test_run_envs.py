@@ -58,7 +58,7 @@ def test_evaluated_and_recorded(zoo_run: Run, tmp_path: Path) -> None:
     with np.load(evaluate_final(zoo_run.folder, 3)) as arrays:
         assert arrays["stochastic/standard/ep_lengths"].tolist() == [LENGTH] * 3
     # One episode from its first frame to its end, whatever wrappers call an episode.
-    assert record(zoo_run.folder, tmp_path / "a.gif", n_episodes=1) == 1.0
+    assert record(zoo_run.folder, tmp_path / "a.gif", n_episodes=1).success == 1.0
     with Image.open(tmp_path / "a.gif") as gif:
         duration = sum(gif.seek(i) or gif.info["duration"] for i in range(gif.n_frames))
     assert duration == (LENGTH + N_LAST) * MILLISECONDS
