@@ -15,6 +15,7 @@ from pathlib import Path
 
 from sb3_abisim.common.cli import PROGRAM, make_parser, run
 from sb3_abisim.common.extras import require_extra
+from sb3_abisim.common.files import write_atomic
 from sb3_abisim.zoo.record import record
 
 ENV_ID = "DistractorPointMaze-v0"
@@ -74,7 +75,7 @@ def plot_learning_curve(run: Path, path: Path, n_smooth: int = 100) -> None:
         axis.locator_params(axis="x", nbins=5)
         axis.grid(alpha=0.3)
     figure.suptitle(f"PPO on a frozen encoder of goal progress, {ENV_ID}")
-    figure.savefig(path, dpi=120)
+    write_atomic(path, lambda file: figure.savefig(file, format="png", dpi=120))
     plt.close(figure)
 
 
@@ -91,14 +92,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     run(parser, argv, _command)
 
 
-def _command(args: argparse.Namespace) -> None:
+def _command(args: argparse.Namespace) -> int:
     # Now, not after three minutes.
     require_extra("plots", "the demo", "matplotlib", "PIL")
     folder, start = Path(args.output), time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     for words in commands(folder, args.n_transitions, args.n_updates, args.n_timesteps):
         print(f"\n$ {shlex.join([PROGRAM, *words[1:]])}", flush=True)
-        subprocess.run([sys.executable, "-m", *words], check=True)
+        code = subprocess.run([sys.executable, "-m", *words], check=False).returncode
+        if code:
+            # It has said why.
+            return code if code > 0 else 1
     zoo_run = newest_run(folder)
     plot_learning_curve(zoo_run, folder / "learning_curve.png")
     success = record(zoo_run, folder / "agent.gif").success
@@ -107,3 +111,4 @@ def _command(args: argparse.Namespace) -> None:
     print(f"  learning curve    {folder / 'learning_curve.png'}")
     print(f"  the agent         {folder / 'agent.gif'}")
     print(f"  everything        {folder.resolve()}")
+    return 0

@@ -15,6 +15,7 @@ from packaging.requirements import Requirement
 from sb3_abisim._version import __version__
 from sb3_abisim.common.cli import make_parser, one_line, run
 from sb3_abisim.common.extras import DISTRIBUTION
+from sb3_abisim.common.files import find
 from sb3_abisim.common.paths import cache_folder, resource_path
 from sb3_abisim.common.text import printable
 
@@ -159,7 +160,7 @@ def model_lines(path: Path) -> Iterator[Line]:
         if name.endswith(".encoder_hash") and value.dtype == th.uint8
     }
     yield _fact("encoder", ", ".join(map(_named, sorted(hashes))) or "none of ours in the model")
-    if next(iter(path.parent.glob("*/args.yml")), None) is None:
+    if not find(path.parent, "*/args.yml"):
         yield _fact("loads here", "not tried: a zip alone can only be unpickled; give its run folder")
     else:
         yield from run_lines(path.parent)
@@ -204,7 +205,7 @@ def lines(path: str | None) -> Iterator[Line]:
     if place.is_dir():
         if (place / "meta.json").is_file():
             yield from dataset_lines(place)
-        elif next(iter(place.glob("*/args.yml")), None) is not None:
+        elif find(place, "*/args.yml"):
             yield from run_lines(place)
         else:
             yield from benchmark_lines(place)

@@ -36,11 +36,12 @@ def test_what_is_missing_is_reported_before_the_work(tmp_path, capsys, monkeypat
     assert not (tmp_path / "demo").exists()
 
 
-def test_a_failing_command_stops_the_demo(tmp_path):
-    import subprocess
-
+def test_a_failing_command_stops_the_demo(tmp_path, capfd):
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "something_else.txt").write_text("mine")
-    with pytest.raises(subprocess.CalledProcessError):
+    with pytest.raises(SystemExit) as stopped:
         main(["-o", str(tmp_path), "--n-transitions", "600"])
+    said = capfd.readouterr().err
+    assert stopped.value.code == 2 and said.startswith("sb3-abisim collect: error: ") and said.count("\n") == 1
     assert (tmp_path / "data" / "something_else.txt").read_text() == "mine"
+    assert not (tmp_path / "ssi.safetensors").exists()

@@ -103,6 +103,9 @@ ROWS: dict[str, tuple[dict[str, float], list[str]]] = {
         "data/test_collect.py::test_full_disk_is_one_message_and_resumes",
         "zoo/test_folders.py::test_merge_keeps_the_old_file_on_a_full_disk",
         "zoo/test_whole_files.py::test_train_keeps_what_it_saved_before_the_disk_was_full",
+        "test_faults.py::test_what_may_not_be_read",
+        "test_faults.py::test_an_output_that_cannot_be",
+        "test_faults.py::test_a_full_disk",
     ]),
 }  # fmt: skip
 _UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "million": MILLION, "billion": 1000 * MILLION}

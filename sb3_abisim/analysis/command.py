@@ -19,7 +19,7 @@ from sb3_abisim.analysis.figures import FIGURES, default_encoders, load_all, mak
 from sb3_abisim.analysis.nav2d_exact import BINS, EVAL_SEED, STEPS, ExactReference, check_nav2d
 from sb3_abisim.analysis.sweep import PAPER_C
 from sb3_abisim.common.cli import make_parser, run
-from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.files import check_output, write_atomic
 from sb3_abisim.pretraining.pretrain import read_env_id
 
 SWEEP_LAYOUTS = 2
@@ -208,6 +208,7 @@ def _make_room(output: Path | None) -> None:
     """Before minutes of computing."""
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
+        check_output(output)
 
 
 def _write(results: dict[str, Any], output: Path | None) -> None:

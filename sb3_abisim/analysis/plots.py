@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.common.extras import needs_extra
+from sb3_abisim.common.files import write_atomic
 
 DPI = 90
 CMAP = "inferno"
@@ -37,7 +38,7 @@ def save(figure: Any, path: Path) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     # Without the version of matplotlib, so that equal figures are equal files.
-    figure.savefig(path, dpi=DPI, metadata={"Software": None})
+    write_atomic(path, lambda file: figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None}))
     pyplot().close(figure)
 
 

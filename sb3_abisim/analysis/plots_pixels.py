@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.analysis.plots import CMAP, as_array, pyplot, save, short_name, show_map, show_profiles
 from sb3_abisim.common.extras import needs_extra
+from sb3_abisim.common.files import write_atomic
 from sb3_abisim.registry import get_traits
 
 N_COLORS = 256
@@ -113,7 +114,7 @@ def _reduce_colors(path: Path) -> None:
 
     with Image.open(path) as image:
         small = image.convert("RGB").quantize(N_COLORS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    small.save(path, optimize=True)
+    write_atomic(path, lambda file: small.save(file, "PNG", optimize=True))
 
 
 def plot_probes(results: dict[str, Any], path: Path) -> None:

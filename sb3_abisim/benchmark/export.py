@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.benchmark.jobs.job import read_manifest
 from sb3_abisim.common.arrays import read_npz
-from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.files import find, write_atomic
 from sb3_abisim.common.hashes import HASHES_NAME, write_hashes
 from sb3_abisim.zoo.run_files import TRAINING_CURVE, NoEpisodesError, hash_run
 from sb3_abisim.zoo.runs import INDEX_NAME, Run, find_runs
@@ -66,7 +66,7 @@ def hash_index(root: Path) -> None:
 
     :param root: of an export
     """
-    manifests = [path.relative_to(root).as_posix() for path in (root / "jobs").glob("*.json")]
+    manifests = [path.relative_to(root).as_posix() for path in find(root / "jobs", "*.json")]
     write_hashes(root, [INDEX_NAME, *manifests])
 
 
@@ -109,7 +109,7 @@ def _copy_run(run: Run, root: Path, target: Path) -> None:
     for name in EVALUATIONS:
         if (run.folder / name).is_file():
             _write_arrays(target / name, read_npz(run.folder / name))
-    if not (any(run.folder.glob("*.monitor.csv")) or (run.folder / TRAINING_CURVE).is_file()):
+    if not (find(run.folder, "*.monitor.csv") or (run.folder / TRAINING_CURVE).is_file()):
         return
     try:
         curve = run.training()
@@ -125,7 +125,7 @@ def _copy_run(run: Run, root: Path, target: Path) -> None:
 def _copy_manifests(runs: list[Run], root: Path, target: Path) -> None:
     """How the runs, and what they rest on, were made: by which command, with which versions, on what, for how long."""
     manifests: dict[str, dict[str, Any]] = {}
-    for path in sorted((root / "jobs").glob("*.json")):
+    for path in find(root / "jobs", "*.json"):
         manifests[path.stem] = read_manifest(path)
     outputs = {run.folder.relative_to(root).as_posix() for run in runs}
     names = [name for name, manifest in manifests.items() if manifest["output"] in outputs]

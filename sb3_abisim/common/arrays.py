@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.files import is_of_system
+
 MAX_BYTES = 1 << 28
 # What NumPy and zipfile raise, beside OSError, for bytes that are damaged: a header is parsed as Python.
 ARRAY_ERRORS = (
@@ -41,7 +43,7 @@ def read_npz(
             found = [name.removesuffix(".npy") for name in archive.namelist()] if names is None else names
             return {name: _read_npy(archive.read(f"{name}.npy")) for name in found}
     except (OSError, *ARRAY_ERRORS) as error:
-        if isinstance(error, FileNotFoundError | PermissionError):
+        if isinstance(error, FileNotFoundError) or is_of_system(error):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(

@@ -28,6 +28,8 @@ _REMEDIES = {
     errno.EISDIR: "a folder is where a file should be; name a file",
     errno.ENOENT: "correct the path",
     errno.ENOSPC: "free some space and run the same command again",
+    errno.EDQUOT: "free some space and run the same command again",
+    errno.EFBIG: "name a place that takes files of this size",
     errno.ELOOP: "a link leads to itself; name another place",
 }
 _EXPONENT = re.compile(r"[-+]?\d+(\.\d*)?[eE][-+]?\d+")
@@ -121,9 +123,9 @@ def run(
         import_packages(args.packages)
         code = function(args)
     except (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, ImportError) as error:
-        parser.exit(2, f"{parser.prog}: error: {_with_remedy(error)}\n")
+        parser.exit(2, f"{parser.prog}: error: {with_remedy(error)}\n")
     except (OSError, FloatingPointError) as error:
-        parser.exit(1, f"{parser.prog}: {_with_remedy(error)}\n")
+        parser.exit(1, f"{parser.prog}: {with_remedy(error)}\n")
     except MemoryError as error:
         what = str(error) and f" ({one_line(error)})"
         parser.exit(1, f"{parser.prog}: out of memory{what}; give it smaller inputs, or more memory\n")
@@ -143,13 +145,16 @@ def _say_in_one_line(
     program: str, usual: Callable[[threading.ExceptHookArgs], object], failed: threading.ExceptHookArgs
 ) -> None:
     if isinstance(failed.exc_value, OSError):
-        print(f"{program}: {_with_remedy(failed.exc_value)}", file=sys.stderr)
+        print(f"{program}: {with_remedy(failed.exc_value)}", file=sys.stderr)
     else:
         usual(failed)
 
 
-def _with_remedy(error: BaseException) -> str:
-    """A message in one line; what the system says of a path ends in what to do."""
+def with_remedy(error: BaseException) -> str:
+    """A message in one line; what the system says of a path ends in what to do.
+
+    :param error: any
+    """
     remedy = _REMEDIES.get(error.errno or 0) if isinstance(error, OSError) else None
     text = one_line(error)
     return f"{text}; {remedy}" if remedy and ";" not in text else text

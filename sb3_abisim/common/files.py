@@ -7,12 +7,13 @@ it when its holder dies, so that a kill leaves nothing to clean up by hand.
 
 import contextlib
 import errno
+import fnmatch
 import hashlib
 import os
 import re
 import secrets
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -20,6 +21,8 @@ from filelock import FileLock, Timeout
 
 LOCK_NAME = ".lock"
 _TEMPORARY_SUFFIX = ".tmp"
+# What the system says of a place, whatever a file holds: access, and space.
+_OF_SYSTEM = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 class FolderLockedError(ValueError):
@@ -37,15 +40,9 @@ def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], ob
     :param size: bytes to reserve before writing, so that a full disk is found out at once; None reserves nothing.
         It must not exceed what ``write_fn`` writes
     :raises ValueError: for a device, a pipe or a folder
-    :raises PermissionError: for a file that may not be written
     :raises OSError: what the system says, ``errno.ENOSPC`` for a full disk; the temporary file is removed
     """
-    path = Path(os.path.realpath(path))
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is no file that could be replaced; name another")
-    if path.exists() and not os.access(path, os.W_OK):
-        # A rename would replace it all the same.
-        raise PermissionError(errno.EACCES, "it may not be written; allow it, or name another file", str(path))
+    path = check_output(path)
     # Random, since processes in containers that share a folder have equal numbers, and threads of one have one.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_TEMPORARY_SUFFIX}")
     try:
@@ -57,14 +54,36 @@ def write_atomic(path: str | os.PathLike[str], write_fn: Callable[[BinaryIO], ob
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # what went wrong is said
+            temporary.unlink()
         raise
     fsync_folder(path.parent)
 
 
+def check_output(path: str | os.PathLike[str]) -> Path:
+    """Whether :func:`write_atomic` could write a file; for commands, before they work for minutes.
+
+    :param path: the file, whose folder may be absent yet
+    :return: what it leads to, where it is a link
+    :raises ValueError: for a device, a pipe or a folder
+    :raises OSError: for a link that leads to itself, and what may not be written
+    """
+    path = Path(os.path.realpath(path))
+    if path.is_symlink():
+        # A rename would replace it, as what may not be written.
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path} is no file that could be replaced; name another")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(errno.EACCES, "it may not be written; allow it, or name another file", str(path))
+    if path.parent.exists() and not os.access(path.parent, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+    return path
+
+
 @contextlib.contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Name the place in the system's errors that name none, as those of writing into an open file.
+    """Name the place in the system's errors that name none, as those of writing into an open file, or a temporary one.
 
     :param path: what is written
     :raises OSError: the same with its file name
@@ -72,9 +91,44 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename is not None or error.errno is None:
+        named = error.filename is not None and not is_temporary(os.path.basename(os.fsdecode(error.filename)))
+        if named or error.errno is None:
             raise
         raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+
+
+def is_of_system(error: BaseException) -> bool:
+    """Whether an error says of a place that it may not be read or written, or is full: no fault of what lies there.
+
+    :param error: any
+    """
+    return isinstance(error, OSError) and error.errno in _OF_SYSTEM
+
+
+def find(folder: str | os.PathLike[str], pattern: str) -> list[Path]:
+    """What ``Path.glob`` finds, sorted; that leaves out in silence what may not be read.
+
+    :param folder: where to look; an absent one holds nothing
+    :param pattern: such as ``*/args.yml`` or ``**/*.parquet``
+    :raises PermissionError: for a folder on the way that may not be read
+    """
+    return sorted(_find(Path(folder), pattern.split("/")))
+
+
+def _find(folder: Path, parts: Sequence[str]) -> Iterator[Path]:
+    first, *rest = parts
+    try:
+        entries = list(os.scandir(folder))
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    if first == "**":
+        yield from _find(folder, rest)
+    for entry in entries:
+        if first == "**":
+            if entry.is_dir(follow_symlinks=False):
+                yield from _find(folder / entry.name, parts)
+        elif fnmatch.fnmatchcase(entry.name, first):
+            yield from _find(folder / entry.name, rest) if rest else (folder / entry.name,)
 
 
 def fsync_folder(path: str | os.PathLike[str]) -> None:

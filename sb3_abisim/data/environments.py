@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
+from sb3_abisim.common.files import is_of_system
 from sb3_abisim.data.copies import FIRST, EnvCopies, WorkerCopies
 from sb3_abisim.data.vectorized import VectorizedCopies, difference, is_vectorized
 from sb3_abisim.envs import ENV_IDS
@@ -87,7 +88,7 @@ def make_vector_env(
         return EnvCopies(make_fns, image_key) if n_workers == 1 else WorkerCopies(make_fns, image_key, n_workers)
     except Exception as error:
         # Whatever an environment raises: a library that is not there, arguments that it does not take, no display.
-        if isinstance(error, ValueError) and wrapper is None:
+        if (isinstance(error, ValueError) and wrapper is None) or is_of_system(error):
             raise
         raise ValueError(_why_not_made(env, env_kwargs, preprocessing, error)) from error
 

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.files import is_of_system
 from sb3_abisim.common.spaces import space_to_json
 from sb3_abisim.common.vocabulary import current_env_kwargs
 from sb3_abisim.data.format import CONTENT_HASH_KEY, DatasetError, describe_factors
@@ -37,6 +38,8 @@ def make_render_fn(path: Path, meta: dict[str, Any]) -> Callable[[dict[str, NDAr
     try:
         env = creator(num_envs=1, **{**spec.kwargs, **env_kwargs})
     except (TypeError, ValueError, OSError, MemoryError) as error:
+        if is_of_system(error):
+            raise
         raise DatasetError(
             f"{path} holds no frames, and {env_id} with {env_kwargs}, which renders them, cannot be made: {error}; "
             "scan files must lie where they lay at collection (relative paths start from the current folder)"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_abisim.common.cli import make_parser, run
 from sb3_abisim.common.extras import require_extra
-from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.files import check_output, write_atomic
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,6 +47,7 @@ def export_encoder(name: str | Path, output: str | Path) -> "EncoderFile":
     if output.suffix not in _NEEDED:
         raise ValueError(f"the output must end in .onnx or .pt2, got {str(output)!r}")
     require_extra("export", f"a file {output.suffix}", *_NEEDED[output.suffix])
+    check_output(output)
     file = load_encoder(name)
     observations, expected = reference_batch(file)
     write, execute = _to_onnx if output.suffix == ".onnx" else _to_program

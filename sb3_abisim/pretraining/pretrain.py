@@ -67,6 +67,7 @@ def pretrain(
     :raises ValueError: if the output belongs to other settings, or anything does not fit together
     :raises FloatingPointError: if a loss, a gradient or a weight is not finite; the last checkpoint stays
     """
+    from sb3_abisim.common.files import check_output
     from sb3_abisim.common.malloc import keep_freed_memory
     from sb3_abisim.pretraining.card import refuse_to_replace
     from sb3_abisim.pretraining.ranks import processes
@@ -78,6 +79,8 @@ def pretrain(
     output = Path(output)
     if output.suffix != ".safetensors":
         raise ValueError(f"the output must end in .safetensors, got {output}")
+    if not output.is_file():
+        check_output(output)
     refuse_to_replace(output.with_suffix(".json"))
     env_id = read_env_id(Path(data))
     base_settings: dict[str, Any] = {}

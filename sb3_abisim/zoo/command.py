@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 import gymnasium as gym
 
-from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs
+from sb3_abisim.common.cli import PROGRAM, import_packages, one_line, parse_pairs, with_remedy
+from sb3_abisim.common.files import is_of_system
 from sb3_abisim.registry import is_import_path
 from sb3_abisim.zoo.auxiliary import GRAMMAR, parse_auxiliary
 from sb3_abisim.zoo.guard import GUARDED, guarded
@@ -93,7 +94,7 @@ def main(argv: Sequence[str]) -> None:
         with contextlib.ExitStack() as stack:
             if command in GUARDED and not is_trusted:
                 stack.enter_context(guarded())
-            if command == "train":
+            if command in ("train", "record_video"):
                 stack.enter_context(saves_whole())
             runpy.run_module(module, run_name="__main__")
     except FloatingPointError as error:
@@ -110,8 +111,10 @@ def main(argv: Sequence[str]) -> None:
         is_mistake = not isinstance(error, TypeError) or "unexpected keyword argument" in str(error)
         if MethodExperimentManager.has_begun or not is_mistake:
             raise
-        print(f"{prog}: error: {one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        # As of every other command.
+        code = 1 if is_of_system(error) else 2
+        print(f"{prog}: {'error: ' if code == 2 else ''}{with_remedy(error)}", file=sys.stderr)
+        sys.exit(code)
     finally:
         MethodExperimentManager.builds_from_yaml = False
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.files import check_output, write_atomic
 from sb3_abisim.registry import get_traits
 from sb3_abisim.zoo.run_envs import final_model, make_run_env, split_kwargs
 from sb3_abisim.zoo.run_files import hash_again
@@ -42,6 +42,8 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100, trust: bool = Fals
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
     # An evaluation that was killed may have left half of what belongs together.
     run = read_run(folder, remade=[FILE_NAME])
+    path = run.folder / FILE_NAME
+    check_output(path)
     model = final_model(run, trust)
     arrays: dict[str, NDArray[Any]] = {}
     for split in get_traits(run.env_id).splits or (None,):
@@ -49,7 +51,6 @@ def evaluate_final(folder: str | Path, n_episodes: int = 100, trust: bool = Fals
         for mode in MODES:
             values = _episodes(model, run, env_kwargs, n_episodes, mode == MODES[0])
             arrays |= {f"{mode}/{split or 'standard'}/{name}": array for name, array in values.items()}
-    path = run.folder / FILE_NAME
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
     write_atomic(path, lambda file: file.write(buffer.getvalue()))

@@ -7,7 +7,7 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_abisim.common.cli import add_trust, make_parser, run
-from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.files import check_output, find, write_atomic
 from sb3_abisim.networks.encoder_file import RUN_COPY
 from sb3_abisim.rl.merge import merge_encoder
 from sb3_abisim.zoo.models import algorithm_class, load_model, read_model_run, unpickled_model
@@ -33,17 +33,18 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _command(args: argparse.Namespace) -> None:
     algorithm_class(args.algo)
+    # As Stable-Baselines3 does.
+    output = args.output if args.output.suffix else args.output.with_suffix(".zip")
+    check_output(output)
     if not args.model.is_file():
         raise ValueError(f"there is no model {args.model}; give the zip in the folder of a run that has ended")
     encoder = args.encoder
     if encoder is None:
-        copies = sorted(args.model.parent.glob(f"*/{RUN_COPY}"))
+        copies = find(args.model.parent, f"*/{RUN_COPY}")
         if len(copies) != 1:
             raise ValueError(f"{args.model.parent} holds {len(copies)} encoder files */{RUN_COPY}; give --encoder")
         encoder = str(copies[0])
     merged = merge_encoder(_model(args), encoder)
-    # As Stable-Baselines3 does.
-    output = args.output if args.output.suffix else args.output.with_suffix(".zip")
     # Its save writes over what is there, which a full disk would leave damaged.
     write_atomic(output, lambda file: merged.save(file))  # type: ignore[arg-type]
     print(f"Wrote {output}, a model that acts on observations")

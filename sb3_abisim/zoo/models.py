@@ -29,6 +29,7 @@ from stable_baselines3.common.save_util import load_from_zip_file, recursive_set
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_abisim.common.files import is_of_system
 from sb3_abisim.common.pickle_size import check_pickle_size
 from sb3_abisim.networks.bounded import BoundedTensors
 from sb3_abisim.rl.unfreeze import unfreeze_encoder
@@ -95,6 +96,8 @@ def _checked_data(path: Path) -> tuple[dict[str, Any], int]:
     try:
         return _read_data(path)
     except Exception as error:
+        if is_of_system(error):
+            raise
         raise ValueError(f"{path} is damaged or no model of Stable-Baselines3 ({error}); copy it again") from error
 
 
@@ -303,5 +306,7 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
         if not all(isinstance(weights, th.Tensor) for weights in policy.values()):
             raise ValueError("its policy holds other things than tensors")
     except Exception as error:
+        if is_of_system(error):
+            raise
         raise ValueError(f"{path} is damaged or no model of Stable-Baselines3 ({error}); copy it again") from error
     return data, policy

@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_abisim.common.cli import add_trust, make_parser, run
 from sb3_abisim.common.extras import needs_extra, require_extra
-from sb3_abisim.common.files import write_atomic
+from sb3_abisim.common.files import check_output, write_atomic
 from sb3_abisim.registry import get_traits
 from sb3_abisim.zoo.run_envs import final_model, make_run_env, split_kwargs
 from sb3_abisim.zoo.runs import read_run
@@ -60,6 +60,7 @@ def record(
 
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
+    check_output(path)
     zoo_run = read_run(run_folder)
     model = final_model(zoo_run, trust)
     kwargs = split_kwargs(zoo_run.env_id, zoo_run.env_kwargs, get_traits(zoo_run.env_id).eval_split)

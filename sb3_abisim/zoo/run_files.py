@@ -13,6 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from sb3_abisim.common.arrays import read_npz
+from sb3_abisim.common.files import find
 from sb3_abisim.common.hashes import HASHES_NAME, write_hashes
 from sb3_abisim.common.yaml_text import read_yaml_file
 
@@ -66,7 +67,7 @@ def result_names(folder: Path) -> list[str]:
 
     :param folder: of a run
     """
-    found = {path for pattern in _RESULTS for path in folder.glob(pattern)}
+    found = {path for pattern in _RESULTS for path in find(folder, pattern)}
     return sorted(path.relative_to(folder).as_posix() for path in found)
 
 
@@ -76,7 +77,7 @@ def hash_run(folder: Path) -> None:
     :param folder: of a run
     """
     # A report needs no means, so that a folder without their hash is read, too.
-    means = [path.relative_to(folder).as_posix() for path in folder.glob(f"*/{MEANS_NAME}")]
+    means = [path.relative_to(folder).as_posix() for path in find(folder, f"*/{MEANS_NAME}")]
     write_hashes(folder, [*result_names(folder), *means])
 
 
@@ -167,7 +168,7 @@ def read_episodes(folder: Path) -> Any:
     """
     from stable_baselines3.common.monitor import load_results
 
-    for path in sorted(folder.glob("*.monitor.csv")):
+    for path in find(folder, "*.monitor.csv"):
         _check_monitor(path)
     episodes = load_results(glob.escape(str(folder)))
     if not len(episodes):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_abisim.common.files import find
 from sb3_abisim.common.hashes import check_hashes
 from sb3_abisim.common.vocabulary import current_result
 from sb3_abisim.zoo.entries import encoding_kwargs
@@ -75,7 +76,7 @@ class Run:
         :param n_points: number of bins; those in which no episode ended are left out
         :raises ValueError: if there are neither episodes nor their curve
         """
-        if not list(self.folder.glob("*.monitor.csv")):
+        if not find(self.folder, "*.monitor.csv"):
             if (self.folder / TRAINING_CURVE).is_file():
                 return read_curve(self.folder / TRAINING_CURVE)
             what = f"{self.folder} holds neither *.monitor.csv nor {TRAINING_CURVE}"
@@ -106,7 +107,7 @@ def read_run(folder: str | Path, remade: Sequence[str] = ()) -> Run:
     :raises ValueError: if it is none, or a file in it is not what it was
     """
     folder = Path(folder)
-    found = list(folder.glob("*/args.yml"))
+    found = find(folder, "*/args.yml")
     if len(found) != 1:
         raise ValueError(f"{folder} is no run folder of rl-zoo3 (no <Env>/args.yml in it)")
     check_hashes(folder, result_names(folder), remade)
@@ -170,7 +171,7 @@ def find_runs(folder: str | Path) -> list[Run]:
             if (folder / entry["folder"]).is_dir()
         ]
     else:
-        paths = sorted(path.parent.parent for path in folder.glob("**/args.yml"))
+        paths = sorted(path.parent.parent for path in find(folder, "**/args.yml"))
         # Where a benchmark's jobs work, nothing has ended.
         runs = [read_run(path) for path in paths if not path.relative_to(folder).as_posix().startswith("work/run-")]
     if not runs:

@@ -13,6 +13,7 @@ from sb3_abisim.common.files import (
     LOCK_NAME,
     FolderLockedError,
     file_hash,
+    find,
     folder_lock,
     remove_temporaries,
     write_atomic,
@@ -197,6 +198,50 @@ def test_a_link_is_written_through(tmp_path: Path) -> None:
         write_atomic(tmp_path / name, lambda file: file.write(b"new"))
         assert (tmp_path / name).is_symlink() and (tmp_path / name).read_text() == "new"
     assert (tmp_path / "target").read_text() == (tmp_path / "made").read_text() == "new"
+
+
+def test_a_link_to_itself_stays(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("other")
+    (tmp_path / "other").symlink_to("link")
+    with pytest.raises(OSError, match="Too many levels") as caught:
+        write_atomic(tmp_path / "link", lambda file: file.write(b"new"))
+    assert caught.value.errno == errno.ELOOP and (tmp_path / "link").is_symlink() and (tmp_path / "other").is_symlink()
+
+
+def test_errors_name_the_file_and_no_temporary_one(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    for path in (tmp_path / "absent" / "new", tmp_path / "file" / "new"):
+        with pytest.raises((FileNotFoundError, NotADirectoryError)) as caught:
+            write_atomic(path, lambda file: file.write(b"new"))
+        assert caught.value.filename == str(path)
+
+
+def test_what_is_found_is_what_glob_finds_and_sorted(tmp_path: Path) -> None:
+    for name in ("b/args.yml", "a/args.yml", "a/c/args.yml", "a/c/other", ".d/args.yml", "args.yml"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "a" / "back").symlink_to(tmp_path)
+    for pattern in ("*/args.yml", "**/args.yml", "args.yml", "*.yml", "a/*/other", "**/c", "absent/*"):
+        assert find(tmp_path, pattern) == sorted(tmp_path.glob(pattern)), pattern
+    assert find(tmp_path / "absent", "*") == find(tmp_path / "args.yml", "*") == []
+
+
+def test_a_folder_that_may_not_be_read_is_not_taken_for_an_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``Path.glob`` leaves it out; to root everything is allowed, so that the system's answer is made."""
+    (tmp_path / "a").mkdir()
+    real = os.scandir
+
+    def scandir(path: Path) -> object:
+        if Path(path).name == "a":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    for pattern in ("*/args.yml", "**/args.yml"):
+        with pytest.raises(PermissionError):
+            find(tmp_path, pattern)
 
 
 def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:

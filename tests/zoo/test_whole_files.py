@@ -20,7 +20,7 @@ from sb3_abisim.zoo.models import load_model
 from sb3_abisim.zoo.run_files import read_yaml
 from sb3_abisim.zoo.runs import read_run
 from sb3_abisim.zoo.saved_spaces import read_vec_normalize
-from sb3_abisim.zoo.whole_files import saves_whole
+from sb3_abisim.zoo.whole_files import _is_whole, saves_whole
 
 resource = pytest.importorskip("resource")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="a limit on the size of files stands for a full disk")
@@ -115,3 +115,14 @@ def test_files_that_are_open_and_names_with_other_suffixes(tmp_path: Path) -> No
         with open(tmp_path / "c", "wb") as file:
             np.savez(file, x=np.ones(3))
     assert np.load(tmp_path / "a.b.npz")["x"].shape == (2,) and np.load(tmp_path / "c")["x"].shape == (3,)
+
+
+def test_half_a_video_is_told_from_a_whole_one(tmp_path: Path) -> None:
+    video_inputs = pytest.importorskip("video_inputs")
+    pytest.importorskip("av")
+    path = tmp_path / "a.mp4"
+    video_inputs.write_video(path)
+    content = path.read_bytes()
+    assert _is_whole(content)
+    for size in (0, 7, 40, len(content) // 2, len(content) - 1):
+        assert not _is_whole(content[:size])

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_abisim.benchmark.jobs.job import read_manifest
+from sb3_abisim.common.files import find
 from sb3_abisim.zoo.runs import INDEX_NAME, Run
 
 
@@ -50,4 +51,4 @@ def run_time(run: Run, clock: str = "seconds") -> RunTime | None:
 
 @functools.cache
 def _manifests(root: Path) -> dict[str, dict[str, Any]]:
-    return {path.stem: read_manifest(path) for path in sorted((root / "jobs").glob("*.json"))}
+    return {path.stem: read_manifest(path) for path in find(root / "jobs", "*.json")}

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.common.arrays import ARRAY_ERRORS
+from sb3_abisim.common.files import find
 from sb3_abisim.common.spaces import fit_actions
 from sb3_abisim.data.copies import ImageLayout
 from sb3_abisim.data.format import CUT, TERMINATED, TRUNCATED
@@ -221,7 +222,7 @@ class _Folder(_Part):
 
     def __init__(self, path: Path) -> None:
         super().__init__(str(path))
-        self._files = {file.stem: file for file in sorted(path.glob("*.npy"))}
+        self._files = {file.stem: file for file in find(path, "*.npy")}
 
     def names(self) -> list[str]:
         return list(self._files)
@@ -308,7 +309,7 @@ def _parts(source: Any) -> tuple[Sequence[_Part], str]:
         return [_Memory(episode, f"episode {i}") for i, episode in enumerate(episodes)], "arrays in memory"
     path = Path(source)
     if path.is_dir():
-        archives = sorted(path.glob("*.npz"))
+        archives = find(path, "*.npz")
         single = _Folder(path)
         if archives and single.names():
             raise ValueError(f"{path} holds .npz and .npy files; leave one kind there")

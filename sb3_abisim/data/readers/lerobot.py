@@ -22,6 +22,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_abisim.common.extras import needs_extra
+from sb3_abisim.common.files import find, is_of_system
 from sb3_abisim.common.spaces import ActionSpace
 from sb3_abisim.data.copies import ImageLayout, factor_name
 from sb3_abisim.data.format import TRUNCATED, from_json_file
@@ -172,7 +173,7 @@ class _Recording:
         return {self.camera, ACTION, *self.state, *_NUMBERING}
 
     def _read_episodes(self, total: int, data_path: str, video_path: str) -> list[_Episode]:
-        files = sorted((self.path / "meta" / "episodes").glob("**/*.parquet"))
+        files = find(self.path / "meta" / "episodes", "**/*.parquet")
         video = f"videos/{self.camera}"
         names = ["episode_index", "length", "data/chunk_index", "data/file_index"]
         names += [f"{video}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")]
@@ -310,6 +311,8 @@ def _read_table(path: Path, names: list[str]) -> dict[str, NDArray[Any]]:
             # Column by column: names with dots are otherwise taken for nested ones.
             return {name: _to_numpy(pyarrow, name, table.read(columns=[name]).column(name)) for name in names}
     except (pyarrow.ArrowException, OSError, ValueError) as error:
+        if is_of_system(error):
+            raise
         raise ValueError(f"{path} cannot be read as LeRobot writes it ({error}); download it again") from None
 
 

@@ -14,6 +14,7 @@ import functools
 import hashlib
 import json
 import os
+import shutil
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
@@ -27,6 +28,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_abisim.common.extras import needs_extra
+from sb3_abisim.common.files import find, is_of_system, naming
 from sb3_abisim.common.spaces import fit_actions, space_from_json, space_to_json
 from sb3_abisim.data.copies import LAST, ImageLayout
 from sb3_abisim.data.dataset import TransitionDataset
@@ -69,6 +71,8 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
     :raises ImportError: without Minari, naming the command that installs it
     """
     minari = _import_minari()
+    from minari.storage.datasets_root_dir import get_dataset_path
+
     _check_id(dataset_id)
     dataset = TransitionDataset(folder)
     source = dataset.meta["source"]
@@ -77,10 +81,29 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
     space = dataset.observation_space
     if channels_last:
         space = _move_channels(space, 0, -1)
+    place = get_dataset_path(dataset_id)
+    is_taken = place.exists()
+    content = hashlib.sha256()
+    # Without its sum while episodes are missing: a kill leaves a dataset that is not taken for a whole one.
+    ours = {key: dataset.meta[key] for key in IDENTITY_KEYS} | {"rewards_recorded": False, "content_sha256": None}
+    try:
+        with naming(place):
+            stored = _create(minari, dataset_id, dataset, space)
+            stored.storage.update_metadata({METADATA_KEY: ours} | _env_spec(dataset))
+            stored.storage.update_episodes(_to_episode(s, channels_last) for s in _hashed(_segments(dataset), content))
+            stored.storage.update_metadata({METADATA_KEY: ours | {"content_sha256": content.hexdigest()}})
+    except BaseException:
+        if not is_taken:
+            shutil.rmtree(place, ignore_errors=True)
+        raise
+
+
+def _create(minari: Any, dataset_id: str, dataset: TransitionDataset, space: gym.Space[Any]) -> Any:
+    """An empty dataset of Minari's."""
     with warnings.catch_warnings():
         # Minari warns about each piece of metadata that is left out.
         warnings.simplefilter("ignore", UserWarning)
-        stored = minari.create_dataset_from_buffers(
+        return minari.create_dataset_from_buffers(
             dataset_id,
             buffer=[],
             observation_space=space,
@@ -90,16 +113,6 @@ def export_dataset(folder: str | Path, dataset_id: str) -> None:
             # True, the default, stores observations of 32 x 32 and more as JPEG, which alters them.
             jpeg_encoding=False,
         )
-    content = hashlib.sha256()
-    # Without its sum while episodes are missing: a kill leaves a dataset that is not taken for a whole one.
-    ours = {key: dataset.meta[key] for key in IDENTITY_KEYS} | {"rewards_recorded": False, "content_sha256": None}
-    try:
-        stored.storage.update_metadata({METADATA_KEY: ours} | _env_spec(dataset))
-        stored.storage.update_episodes(_to_episode(s, channels_last) for s in _hashed(_segments(dataset), content))
-        stored.storage.update_metadata({METADATA_KEY: ours | {"content_sha256": content.hexdigest()}})
-    except BaseException:
-        minari.delete_dataset(dataset_id)
-        raise
 
 
 def _env_spec(dataset: TransitionDataset) -> dict[str, str]:
@@ -224,7 +237,7 @@ def _open_storage(dataset_id: str) -> tuple[Any, dict[str, Any]]:
     path = get_dataset_path(dataset_id) / "data"
     if not path.is_dir():
         raise ValueError(f"no Minari dataset {dataset_id!r} at {path}; fetch it first: minari download {dataset_id}")
-    for file in path.rglob("*.hdf5"):
+    for file in find(path, "**/*.hdf5"):
         _check_hdf5(file)
     metadata = MinariStorage.read_raw_metadata(path)
     # Where a space is missing, Minari would make the environment to ask it, and with it run what the file names.
@@ -282,6 +295,8 @@ def _check_hdf5(path: Path) -> None:
         with h5py.File(path, "r") as file:
             check("", file)
     except (OSError, RuntimeError, KeyError, ValueError, RecursionError) as error:
+        if is_of_system(error):
+            raise
         raise ValueError(f"{path} is damaged or no file of Minari's ({error}); fetch it again") from error
 
 

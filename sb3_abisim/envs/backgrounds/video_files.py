@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sb3_abisim.common.files import find
 from sb3_abisim.envs.backgrounds.clips import SPLITS, split_groups
 from sb3_abisim.envs.backgrounds.video_roles import (
     CONTAINER_FOLDERS,
@@ -150,9 +151,14 @@ def _is_medium(name: str) -> bool:
     return not name.lower().endswith(SIDECAR_SUFFIXES) and "." in name
 
 
+def _refuse(error: OSError) -> None:
+    """Of a folder that may not be read: without it, the split would be another."""
+    raise error
+
+
 def _count_suffixes(root: Path) -> str:
     suffixes: Counter[str] = Counter()
-    for _, _, names in os.walk(root):
+    for _, _, names in os.walk(root, onerror=_refuse):
         suffixes.update(Path(name).suffix.lower() or "no suffix" for name in names)
     return ", ".join(f"{n} x {suffix}" for suffix, n in suffixes.most_common(5)) or "an empty folder"
 
@@ -160,7 +166,7 @@ def _count_suffixes(root: Path) -> str:
 def _find(root: Path, split: str | None, top: Path, found: Found) -> None:
     prefix = f"{root.name}/" if split else ""
     seen = {root.resolve()}
-    for folder, subfolders, names in os.walk(root, followlinks=True):
+    for folder, subfolders, names in os.walk(root, onerror=_refuse, followlinks=True):
         here = Path(folder)
         subfolders[:] = [name for name in sorted(subfolders) if not name.startswith(".")]
         for name in subfolders:
@@ -226,7 +232,7 @@ def _find_davis(root: Path, frames: Path) -> Found:
                 f"{root} looks like DAVIS but has no {path}; restore it, or give {frames} for a split by hash"
             )
         for name in path.read_text(encoding="utf-8").split():
-            files = sorted((frames / name).glob("*.jpg"), key=lambda file: natural_key(file.name))
+            files = sorted(find(frames / name, "*.jpg"), key=lambda file: natural_key(file.name))
             if not files:
                 raise ValueError(f"{path} lists {name!r} but {frames / name} has no *.jpg; unpack it or edit the list")
             found.sources.append(_source(name, name, frames / name, tuple(files), split))

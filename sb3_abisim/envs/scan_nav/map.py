@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.common.arrays import read_npz
 from sb3_abisim.common.extras import require_extra
-from sb3_abisim.common.files import file_hash, write_atomic
+from sb3_abisim.common.files import file_hash, is_of_system, write_atomic
 from sb3_abisim.common.paths import CACHE_VARIABLE, cache_folder
 from sb3_abisim.common.vocabulary import current_scan_map
 from sb3_abisim.envs.scan_nav.build import MapSettings, map_fields
@@ -190,6 +190,8 @@ class ScanMap:
         except SceneError:
             raise
         except _UNREADABLE as error:
+            if is_of_system(error):
+                raise
             raise SceneError(f"{path} is not a scan map ({error}); copy or write it again") from error
 
 
@@ -219,8 +221,8 @@ def _cached(content: list[Any], settings: MapSettings, make: Callable[[], ScanMa
     path = cache_folder("scans") / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
     try:
         kept = ScanMap.load(path)
-    except SceneError:
-        kept = None  # absent, or damaged: made anew
+    except (SceneError, OSError):
+        kept = None  # absent, damaged or not to be read: made anew
     if kept is not None and all(_hash(folder / name) == hash for name, hash in kept.settings["files"].items()):
         warn_missing(kept.source, (name for name, hash in kept.settings["files"].items() if not hash))
         return kept
