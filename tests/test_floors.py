@@ -1,6 +1,7 @@
 """What each folder may import: the floors of the house, from the ground up, and no circle."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +56,7 @@ def imported(path: Path) -> set[str]:
     return found & FLOOR_OF.keys()
 
 
+@functools.cache
 def arrows() -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {room: set() for room in FLOOR_OF}
     for path in PACKAGE.rglob("*.py"):
