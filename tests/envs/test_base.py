@@ -1,5 +1,6 @@
 """What every registered environment promises, checked over all ids."""
 
+import copy
 import inspect
 import itertools
 import warnings
@@ -7,6 +8,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import WrapperSpec
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
@@ -241,3 +243,15 @@ def test_refuses_bad_settings(kwargs, message):
         Nav2DVectorEnv(num_envs=2).reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="goal"):
         Nav2DVectorEnv(num_envs=2).reset(options={"goal": 3})
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_why_no_wrapper_refuses_steps_after_a_truncation(env_id: str) -> None:
+    """Gymnasium makes no batch of an id that is registered with one, and tells the environment nothing of its limit."""
+    spec = copy.deepcopy(gym.spec(env_id))
+    assert spec.max_episode_steps and gym.make(spec).unwrapped.spec.max_episode_steps is None
+    spec.additional_wrappers = (WrapperSpec("W", "gymnasium.wrappers:OrderEnforcing", {}),)
+    with pytest.raises(
+        gym.error.Error, match="Cannot use `vector_entry_point` vectorization mode with the additional_w"
+    ):
+        gym.make_vec(spec, 2, vectorization_mode="vector_entry_point")

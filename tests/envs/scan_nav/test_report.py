@@ -99,6 +99,14 @@ def test_every_way_of_writing_a_room_is_the_room_or_refused(tmp_path, room, ceil
     assert "unit: meters" in capsys.readouterr().err
 
 
+def test_yards_are_taken_for_meters_unless_the_unit_is_given(tmp_path, capsys):
+    """A storey in yards is a plausible one in meters; docs/scan_files.md says so."""
+    path = save(tmp_path / "room.ply", sheets(True), points=lambda v: v / 0.9144)
+    assert make(path).settings["report"]["storey_height"] == pytest.approx(HEIGHT / 0.9144, abs=0.01)
+    assert "unit: meters" in capsys.readouterr().err
+    assert make(path, meters_per_unit=0.9144).settings["report"]["storey_height"] == pytest.approx(HEIGHT, abs=0.01)
+
+
 def test_the_message_names_the_remedy(tmp_path):
     for done, ways in (("z down", "up='-z'"), ("flipped", "flip_faces=True"), ("feet", "meters_per_unit=0.3048")):
         path = save(tmp_path / "room.ply", sheets(True), **DONE[done][0])
