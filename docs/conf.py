@@ -5,6 +5,7 @@ itself is Sphinx's source folder, and each link holds in both places as it is.
 """
 
 import importlib
+import inspect
 import pkgutil
 import re
 import sys
@@ -80,7 +81,9 @@ def _title(text: str) -> str:
 
 
 def _first_sentence(thing: object) -> str:
-    return (thing.__doc__ or "").strip().partition("\n")[0].replace("::", ":")
+    # An alias of a generic class is described where the class is.
+    paragraph = (inspect.getdoc(getattr(thing, "__origin__", thing)) or "").partition("\n\n")[0]
+    return re.split(r"(?<=\.)\s", " ".join(paragraph.split()).replace("::", "."))[0]
 
 
 def _public_names() -> str:

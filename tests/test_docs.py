@@ -171,5 +171,8 @@ def the_reference_has_every_public_name(built: dict[Path, Page], site: Path) -> 
             assert f"{thing.__module__}.{thing.__name__}" in ids, name
     for method in methods().values():
         assert f"sb3_abisim.{method.extractor}" in ids
+    rows = re.findall(r"<tr.*?</tr>", (site / "docs" / "api" / "index.html").read_text(encoding="utf-8"), re.DOTALL)
+    sentences = [re.sub(r"<.*?>", "", row.rpartition("<td>")[2]).strip() for row in rows]
+    assert len(sentences) > 30 and not [text for text in sentences if not re.search(r"\w.*\.$", text)]
     text = re.sub(r"\s+", " ", built[site / "docs" / "api" / "rl.html"].prose)
     assert "what observations are augmented by while they are learned from" in text, "a parameter's description"

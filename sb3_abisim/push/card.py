@@ -152,6 +152,8 @@ def _making(file: EncoderFile) -> Lines:
         if card["settings"] != metadata["settings"] or card["dataset"]["hash"] != metadata["dataset_hash"]:
             raise ValueError(f"the model card {path} is not of {file.path}; copy both from where they were pretrained")
         lines += code_block("", commands)
+        if base_hash := card["settings"].get("base_hash"):
+            lines += [f"BASE is the encoder with the hash {inert(base_hash)}.", ""]
         n = max((len(values) for values in curves.values()), default=0)
         shown = sorted({*np.linspace(0, n - 1, N_LOG_ROWS + 1).round().astype(int).tolist()}) if n else []
         rows = [[inert(name), *(_number(values[k]) for k in shown)] for name, values in sorted(curves.items())]

@@ -131,6 +131,9 @@ def test_the_log_and_the_commands_of_pretraining(tmp_path: Path) -> None:
     path.with_suffix(".json").write_text(json.dumps(card))
     text = make_card(load_encoder(path), "me/enc", None, [])
     assert "sb3-abisim collect --env Nav2D-v0" in text and "| n\\_updates | 500 |" in text
+    assert "BASE" not in text
+    above = make_card(load_encoder("Nav2D-v0/abisim"), "me/enc", None, [])
+    assert "--base BASE" in above and f"BASE is the encoder with the hash {source.hash}." in above
     other = {**card, "settings": {**card["settings"], "seed": 99}}
     for wrong, message in ((other, "is not of"), ({**card, "commands": None}, "is damaged")):
         path.with_suffix(".json").write_text(json.dumps(wrong))
