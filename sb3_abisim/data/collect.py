@@ -115,7 +115,9 @@ def collect(
     source = ShardSource(make_fn, env_id, env_kwargs, seed, there, preprocessing, policy, one_pass)
     # Not beside the error of an environment that cannot be collected from at all.
     if progress and reason:
-        print(f"{env_id} steps as single environments, not as its vector environment: {reason}", file=sys.stderr)
+        print(
+            f"{env_id}: copies are stepped one by one, without its faster vector environment: {reason}", file=sys.stderr
+        )
     try:
         return _collect(source, n_transitions, folder, progress)
     finally:

@@ -126,7 +126,7 @@ def as_made_or_reason(env_id: str, env_kwargs: dict[str, Any], preprocessing: Pr
     if spec is None or spec.vector_entry_point is None or spec.entry_point is None or batch_class(env_id) is not None:
         return False, ""
     if preprocessing.wrapper is not None or preprocessing.image_key is not None:
-        return False, "env_wrapper and image_key apply to single environments"
+        return False, "env_wrapper and --image-key, here or in the zoo's entry, apply to single environments"
     make_vec_fn = functools.partial(gym.make_vec, env_id, vectorization_mode="vector_entry_point", **env_kwargs)
     reason = difference(make_vec_fn, _make_fn(env_id, env_kwargs))
     return reason is None, reason or ""

@@ -120,7 +120,7 @@ def test_a_vector_entry_point_is_stepped_where_it_shows_what_single_environments
         np.testing.assert_array_equal(getattr(single, array)(everything), getattr(whole, array)(everything))
     assert whole.ends.tolist() == single.ends.tolist() and whole.preprocessing == {}
     if reason:
-        assert f"{name}-v0 steps as single environments, not as its vector environment: {reason}" in said
+        assert f"{name}-v0: copies are stepped one by one, without its faster vector environment: {reason}" in said
     else:
         assert "single environments" not in said
         cls = NextStepVectorEnv if name.startswith("Next") else SameVectorEnv
