@@ -166,12 +166,8 @@ class MethodExperimentManager(exp_manager.ExperimentManager):  # type: ignore[mi
         """
         self._used = dict(hyperparams)
         processed, *rest = super()._preprocess_hyperparams(hyperparams)
-        kwargs = processed.get("policy_kwargs")
-        if self._spec is not None and isinstance(self._used.get("policy_kwargs"), str):
-            # A text, which rl-zoo3 has just evaluated.
-            kwargs = self._spec.policy_kwargs(kwargs)
-        if kwargs is not None:
-            processed["policy_kwargs"] = resolve_classes(kwargs)
+        if processed.get("policy_kwargs") is not None:
+            processed["policy_kwargs"] = resolve_classes(processed["policy_kwargs"])
         self._policy_kwargs: dict[str, Any] = dict(processed.get("policy_kwargs") or {})
         return processed, *rest
 

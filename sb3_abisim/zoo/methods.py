@@ -14,6 +14,7 @@ from sb3_abisim.rl.combined import CombinedEncoderExtractor
 from sb3_abisim.rl.file_network import check_objective, network_arguments, stored_network
 from sb3_abisim.zoo.auxiliary import auxiliary_text, parse_auxiliary
 from sb3_abisim.zoo.entries import ENCODER_CALLBACK, ENCODING_WRAPPER
+from sb3_abisim.zoo.named import read_text
 from sb3_abisim.zoo.preprocessing import check_preprocessing, class_name, frame_stack_of, items
 
 # What may stand after a method as ",name=value", in this order, and the type of the value.
@@ -140,21 +141,21 @@ class MethodSpec:
     def hyperparameters(self, entry: Mapping[str, Any], given: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """What this method puts in place of an entry's values; all else stays.
 
-        :param entry: of a zoo YAML
+        :param entry: of a zoo YAML; ``policy_kwargs`` may be a text, as rl-zoo3's mostly are
         :param given: hyperparameters that the user sets
-        :return: ``policy_kwargs``, unless the entry gives them as a text: :meth:`policy_kwargs` takes them once rl-zoo3
-            has evaluated it; ``policy`` and, for a frozen encoder without task features and augmentation,
-            ``vec_env_wrapper``; ``frame_stack``, where a frozen
-            encoder's observations are stacked before it; ``callback``, where the entry has no ``EncoderCallback``
+        :return: ``policy_kwargs``; ``policy`` and, for a frozen encoder without task features and augmentation,
+            ``vec_env_wrapper``; ``frame_stack``, where a frozen encoder's observations are stacked before it;
+            ``callback``, where the entry has no ``EncoderCallback``
         :raises ValueError: when the method has no encoder, the policy takes none, the method sets what the user sets,
             or a frozen encoder would be shown other stacks than in pretraining
         """
         given = given or {}
-        replaced: dict[str, Any] = {}
-        kwargs, encoder = entry.get("policy_kwargs") or {}, None
-        if isinstance(kwargs, Mapping):
-            encoder = _encoder_name(kwargs)
-            replaced["policy_kwargs"] = self.policy_kwargs(kwargs)
+        kwargs = entry.get("policy_kwargs") or {}
+        if isinstance(kwargs, str):
+            # Read, not evaluated, so that the run's config.yml holds what the model is made of.
+            kwargs = read_text(kwargs, "the entry of the hyperparameters")
+        encoder = _encoder_name(kwargs)
+        replaced: dict[str, Any] = {"policy_kwargs": self.policy_kwargs(kwargs)}
         file = self._file(encoder)
         key = self._key(file)
         if self.embeds_in_env and key is None:
@@ -162,7 +163,7 @@ class MethodSpec:
             replaced["vec_env_wrapper"] = [*items(entry.get("vec_env_wrapper")), wrapper]
         if self.embeds_in_env or "policy" not in given:
             replaced["policy"] = self._policy(str(entry.get("policy")), key)
-        for name in sorted({"policy_kwargs", *replaced} & set(given)):
+        for name in sorted(replaced.keys() & set(given)):
             raise ValueError(f"-params {name} would undo --conf-file {self.name}; give one of the two")
         settings = {**entry, **given}
         if "vec_env_wrapper" in replaced and file is not None and (settings.get("frame_stack") or 1) > 1:

@@ -6,11 +6,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import yaml
 from gymnasium import spaces
+from torch import nn
 from zoo_inputs import SMALL, run
 
 from sb3_abisim.networks.encoder_file import load_encoder
 from sb3_abisim.rl.checks import find_extractors
+from sb3_abisim.zoo import entries, manager
 from sb3_abisim.zoo.evaluate import evaluate_final
 from sb3_abisim.zoo.method_record import MethodRecord
 from sb3_abisim.zoo.record import record
@@ -127,6 +130,28 @@ def test_frozen(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert written is not None and written.label == "ssi,frozen"
     assert all(extractor.frozen for _, extractor in find_extractors(final_model(read_run(folder)).policy))
     assert np.load(evaluate_final(folder, 2))["deterministic/standard/ep_lengths"].tolist() == [LENGTH] * 2
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_an_entry_of_the_zoo_whose_policy_kwargs_are_a_text(
+    frozen: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As that of CarRacing, for one: what is saved says all that the model is made of."""
+    entry = {"normalize": "dict(norm_obs=False, norm_reward=True)", "policy": "CnnPolicy", "n_timesteps": 64}
+    entry["policy_kwargs"] = "dict(log_std_init=-2, activation_fn=nn.GELU, net_arch=dict(pi=[7], vf=[8]), )"
+    (tmp_path / "ppo.yml").write_text(yaml.dump({"Odd-v0": entry}))
+    for module in (entries, manager):
+        monkeypatch.setattr(module, "zoo_hyperparams", lambda: tmp_path)
+    for words in commands(tmp_path, ["shape:[37, 41, 3]", "actions:box"], [], "ppo", frozen):
+        run(monkeypatch, *words)
+    folder = tmp_path / "logs" / "ppo" / "Odd-v0_1"
+    policy = final_model(read_run(folder)).policy
+    heads = policy.mlp_extractor.policy_net, policy.mlp_extractor.value_net
+    assert [head[0].out_features for head in heads] == [7, 8]
+    assert all(isinstance(head[1], nn.GELU) for head in heads)
+    assert [extractor.hash for _, extractor in find_extractors(policy)] or frozen
+    assert np.load(evaluate_final(folder, 2))["deterministic/standard/ep_lengths"].tolist() == [LENGTH] * 2
+    record(folder, tmp_path / "a.gif", n_episodes=1)
 
 
 @pytest.mark.parametrize(

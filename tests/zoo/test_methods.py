@@ -5,10 +5,9 @@ from typing import Any
 
 import pytest
 import torch as th
-from torch import nn
 from zoo_inputs import write_encoder
 
-from sb3_abisim.zoo.entries import ENCODER_CALLBACK, ENCODING_WRAPPER
+from sb3_abisim.zoo.entries import ENCODER_CALLBACK, ENCODING_WRAPPER, read_entries, zoo_hyperparams
 from sb3_abisim.zoo.methods import MethodSpec
 
 
@@ -131,15 +130,27 @@ def test_an_entry_of_rl_zoo3() -> None:
 
 
 def test_an_entry_with_a_text() -> None:
-    """rl-zoo3 evaluates it, then the method replaces what chooses the extractor."""
-    entry = {"policy": "CnnPolicy", "policy_kwargs": "dict(net_arch=[7])"}
-    assert "policy_kwargs" not in MethodSpec("ssi", "f").hyperparameters(entry)
-    evaluated = {"net_arch": [7], "features_extractor_class": nn.Module, "features_extractor_kwargs": {"width": 3}}
-    assert MethodSpec("vanilla").policy_kwargs(evaluated) == {
-        "net_arch": [7],
+    """As rl-zoo3 writes them: what chooses the extractor is replaced, all else stays."""
+    text = "dict(net_arch=[7], activation_fn=nn.GELU, features_extractor_class=nn.Module, ortho_init=False)"
+    entry = {"policy": "CnnPolicy", "policy_kwargs": text}
+    kept = {"net_arch": [7], "activation_fn": "torch.nn.GELU", "ortho_init": False}
+    assert MethodSpec("vanilla").hyperparameters(entry)["policy_kwargs"] == {
+        **kept,
         "features_extractor_class": "sb3_abisim.VanillaExtractor",
     }
-    assert MethodSpec("ssi", "f", True).policy_kwargs(evaluated) == {"net_arch": [7]}
+    assert MethodSpec("ssi", "f", True).hyperparameters(entry)["policy_kwargs"] == kept
+
+
+def test_every_text_of_rl_zoo3s_entries_is_read() -> None:
+    texts = [
+        entry["policy_kwargs"]
+        for path in zoo_hyperparams().glob("*.yml")
+        for entry in read_entries(path).values()
+        if isinstance(entry, dict) and isinstance(entry.get("policy_kwargs"), str)
+    ]
+    assert len(texts) > 100
+    for text in texts:
+        assert MethodSpec("vanilla").hyperparameters({"policy": "CnnPolicy", "policy_kwargs": text})["policy_kwargs"]
 
 
 def test_what_the_user_sets_beside_a_method() -> None:
