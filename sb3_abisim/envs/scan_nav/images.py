@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.common.images import too_many_passes
-from sb3_abisim.envs.scan_nav.files import MAX_IMAGE_SIDE, REEXPORT, Budget, ScanFiles, SceneError
+from sb3_abisim.envs.scan_nav.files import (
+    MAX_IMAGE_SIDE,
+    MAX_WEBP_PIXELS,
+    REEXPORT,
+    Budget,
+    FileSpan,
+    ScanFiles,
+    SceneError,
+)
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA")
 # Pillow's modes of 8 bits per channel, whose conversion to RGB changes no color.
@@ -62,17 +70,19 @@ class Images:
         :param found: by :meth:`ScanFiles.find`
         """
         if found not in self._known:
+            self._budget.check_image_file(found, self._files.size(found))
             self._known[found] = self._decode(self._files.read(found), found)
         return self._known[found]
 
-    def decode(self, data: bytes, name: str) -> Image:
+    def decode(self, data: bytes | FileSpan, name: str) -> Image:
         """A texture inside the scan.
 
         :param data: a PNG, JPEG or WebP file
         :param name: for messages, and to decode it once
         """
         if name not in self._known:
-            self._known[name] = self._decode(data, name)
+            self._budget.check_image_file(name, len(data))
+            self._known[name] = self._decode(data[:], name)
         return self._known[name]
 
     def shaded(self, name: str, factor: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -138,6 +148,11 @@ class Images:
         except Exception as error:  # what Pillow raises depends on where the damage is
             raise SceneError(unreadable) from error
         self._budget.add_image(name, *image.size, self._new_bytes(data))
+        if image.format == "WEBP" and image.width * image.height > MAX_WEBP_PIXELS:
+            raise SceneError(
+                f"{self._files.path}: the texture {name} has {image.width} x {image.height} pixels, and one of WebP "
+                f"may have {MAX_WEBP_PIXELS // 10**6} million; save it as PNG or JPEG"
+            )
         if too_many_passes(data, *image.size):
             raise SceneError(unreadable)
         if image.mode not in _MODES:
