@@ -16,6 +16,8 @@ MAX_FACES = 8_000_000
 MAX_VERTICES = 24_000_000
 MAX_INSTANCES = 100_000
 MAX_IMAGE_SIDE = 8192
+MAX_IMAGE_FILE_BYTES = 300_000_000  # four for each pixel of the largest, and what is written about it
+MAX_WEBP_PIXELS = 34_000_000  # its decoder takes 16 bytes for each
 MAX_IMAGE_PIXELS = 512_000_000  # of all textures together
 # A few bytes can declare an image of any size; these many pixels are granted in any case, and then so many per byte.
 FREE_IMAGE_PIXELS = 68_000_000
@@ -52,6 +54,18 @@ class Budget:
             raise SceneError(
                 f"{self._path} declares {self._counts[what]} {what}, more than {limit}; decimate the scan, or cut it "
                 "into several"
+            )
+
+    def check_image_file(self, name: str, n_bytes: int) -> None:
+        """Refuse a texture before its file is read.
+
+        :param name: of the texture
+        :param n_bytes: of its file
+        :raises SceneError: for more than any texture takes
+        """
+        if n_bytes > MAX_IMAGE_FILE_BYTES:
+            raise SceneError(
+                f"{self._path}: the texture {name} has {n_bytes} bytes, more than {MAX_IMAGE_FILE_BYTES}; {REEXPORT}"
             )
 
     def add_image(self, name: str, width: int, height: int, n_bytes: int) -> None:
@@ -101,6 +115,35 @@ def check_file(path: Path) -> None:
         )
 
 
+class FileSpan:
+    """A part of a file, sliced as bytes are; what nobody asks for is not read.
+
+    :param path: of the file
+    :param begin: of the part
+    :param length: of the part, within the file
+    """
+
+    def __init__(self, path: Path, begin: int, length: int) -> None:
+        self._path, self._begin, self._length = path, begin, length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, part: slice) -> bytes:
+        begin, end, _ = part.indices(self._length)
+        with open(self._path, "rb") as file:
+            file.seek(self._begin + begin)
+            return file.read(max(end - begin, 0))
+
+    def span(self, begin: int, length: int) -> "FileSpan":
+        """A part of this one.
+
+        :param begin: of the part
+        :param length: of the part, within this one
+        """
+        return FileSpan(self._path, self._begin + begin, length)
+
+
 class ScanFiles:
     """The files in a scan's folder that it refers to. Nothing outside of the folder is read.
 
@@ -140,13 +183,20 @@ class ScanFiles:
         self.missing.append(name)
         return None
 
+    def size(self, found: str) -> int:
+        """How many bytes a file has.
+
+        :param found: by :meth:`find`
+        """
+        return (self.folder / found).stat().st_size
+
     def read(self, found: str) -> bytes:
         """The content of a file.
 
         :param found: by :meth:`find`
         """
         file = self.folder / found
-        if file.stat().st_size > MAX_FILE_BYTES:
+        if self.size(found) > MAX_FILE_BYTES:
             raise SceneError(f"{self.path}: {found} has more than {MAX_FILE_BYTES} bytes; decimate the scan")
         self.hashes[found] = file_hash(file)
         return file.read_bytes()

@@ -16,7 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.envs.scan_nav.files import Budget, ScanFiles, SceneError
+from sb3_abisim.envs.scan_nav.files import Budget, FileSpan, ScanFiles, SceneError
 
 # Extensions that are read.
 _READ = {
@@ -74,11 +74,8 @@ class GltfFile:
 
     def __init__(self, path: Path, files: ScanFiles, budget: Budget) -> None:
         self.path, self.files, self.budget = path, files, budget
-        data = path.read_bytes()
-        self._binary: bytes | memoryview = b""
-        if path.suffix.lower() == ".glb":
-            data = self._open_glb(data)
-        self.header = json.loads(data)
+        self._binary: bytes | FileSpan = b""
+        self.header = json.loads(self._open_glb() if path.suffix.lower() == ".glb" else path.read_bytes())
         if not isinstance(self.header, dict):
             raise SceneError(f"{path} is not glTF: its JSON part is no object; download or export it again")
         version = str(self.header.get("asset", {}).get("version", ""))
@@ -88,9 +85,10 @@ class GltfFile:
         self._check_extensions()
         # Then coordinates of textures may be whole numbers, which a transform scales.
         self.quantized = "KHR_mesh_quantization" in self.header.get("extensionsUsed", [])
-        self._buffers: dict[int, bytes | memoryview] = {}
+        self._buffers: dict[int, bytes | FileSpan] = {}
 
-    def _open_glb(self, data: bytes) -> bytes:
+    def _open_glb(self) -> bytes:
+        data = FileSpan(self.path, 0, self.path.stat().st_size)
         if len(data) < 20 or data[:4] != b"glTF":
             raise SceneError(
                 f"{self.path} is not a binary glTF file; download it again, or give it the suffix of its format"
@@ -108,7 +106,7 @@ class GltfFile:
             if begin + 8 + length > total:
                 raise SceneError(f"{self.path} is truncated: its binary part is not whole; download it again")
             if kind == b"BIN\0":
-                self._binary = memoryview(data)[begin + 8 : begin + 8 + length]
+                self._binary = FileSpan(self.path, begin + 8, length)
         return data[20:begin]
 
     def _check_extensions(self) -> None:
@@ -143,19 +141,19 @@ class GltfFile:
         entry: dict[str, Any] = entries[index]
         return entry
 
-    def view(self, index: Any) -> bytes | memoryview:
-        """The bytes of a buffer view.
+    def view(self, index: Any) -> bytes | FileSpan:
+        """The bytes of a buffer view, or where they lie.
 
         :param index: of it
         """
         view = self.item("bufferViews", index)
         begin, length = _whole(view.get("byteOffset", 0)), _whole(view["byteLength"])
         data = self._buffer(view["buffer"])
-        if begin + length > len(data):
+        if begin + length > _whole(self.item("buffers", view["buffer"])["byteLength"]):
             raise self.bad("is damaged: a buffer view reaches beyond its buffer", "download or export it again")
-        return data[begin : begin + length]
+        return data.span(begin, length) if isinstance(data, FileSpan) else data[begin : begin + length]
 
-    def _buffer(self, index: Any) -> bytes | memoryview:
+    def _buffer(self, index: Any) -> bytes | FileSpan:
         if index not in self._buffers:
             buffer = self.item("buffers", index)
             uri, length = buffer.get("uri"), _whole(buffer["byteLength"])
@@ -164,7 +162,7 @@ class GltfFile:
                 raise self.bad(f"refers to {uri}, which is not there", "put it beside the scan, or export a .glb file")
             if len(data) < length:
                 raise self.bad(f"is truncated: a buffer has {len(data)} of {length} bytes", "download it again")
-            self._buffers[index] = data[:length]
+            self._buffers[index] = data
         return self._buffers[index]
 
     def uri(self, uri: Any, what: str) -> bytes | None:
@@ -226,7 +224,8 @@ class GltfFile:
         stride = _whole(self.item("bufferViews", view).get("byteStride", width)) if strided else width
         if stride < width or (count and offset + (count - 1) * stride + width > len(data)):
             raise self.bad("is damaged: an accessor reaches beyond its buffer view", "download or export it again")
-        return np.ndarray((count, columns), dtype, data, offset, (stride, dtype.itemsize))
+        part = data[offset : offset + (count - 1) * stride + width if count else offset]
+        return np.ndarray((count, columns), dtype, part, 0, (stride, dtype.itemsize))
 
     def fractions(self, index: Any, *types: str) -> NDArray[np.float32]:
         """An accessor's numbers, where integers stand for fractions if they are normalized.

@@ -136,7 +136,7 @@ def read_texture(file: GltfFile, images: Images, index: int) -> tuple[tuple[str,
     entry = file.item("images", source)
     key = f"{entry['name']} ({source})" if entry.get("name") else f"image {source}"
     if "bufferView" in entry:
-        return (key, images.decode(bytes(file.view(entry["bufferView"])), key)), wrap
+        return (key, images.decode(file.view(entry["bufferView"]), key)), wrap
     uri = entry.get("uri")
     if isinstance(uri, str) and not uri.startswith("data:"):
         found = file.files.find(uri)

@@ -32,7 +32,7 @@ from sb3_abisim.envs.scan_nav.report import plausible_report, with_walkable
 FORMAT = "sb3_abisim scan map 1"
 MIN_WALKABLE_AREA = 1.0  # m2
 # Hashed into the names of cached maps: raise it where the same mesh gives another map.
-_VERSION = 6
+_VERSION = 7
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,8 @@ class ScanMesh:
     :param faces: int64 (m, 3), counter-clockwise seen from outside
     :param surfaces: how the faces are colored, in their order
     :param files: what was read: path relative to the scan's folder, to its sha256, or to "" for a missing file
-    :param notes: what was understood and done, JSON types: ``up``, ``lean`` in degrees, ``textures``, ``transparent``
+    :param notes: what was understood and done, JSON types: ``up``, ``lean`` in degrees, ``textures``,
+        ``texture_factor``, ``transparent_faces``
     """
 
     vertices: NDArray[np.float64]
@@ -93,31 +94,54 @@ def load_mesh(
     return ScanMesh(vertices, mesh.faces, mesh.surfaces, mesh.files, {**mesh.notes, "up": chosen, "lean": lean})
 
 
+@dataclass
+class _Reading:
+    """A scan as its format's reader gives it.
+
+    :param images: its textures
+    :param parts: its parts
+    :param n_points: points and lines, which are no surface
+    :param n_bare: parts without any color
+    :param unknown: properties whose meaning is not known
+    """
+
+    images: Images
+    parts: list[Part]
+    n_points: int
+    n_bare: int
+    unknown: list[str]
+
+
 def _read(path: Path, files: ScanFiles) -> tuple[list[Part], dict[str, str | float | int]]:
-    budget = Budget(path)
-    images = Images(files, budget)
-    unknown: list[str] = []
-    suffix = path.suffix.lower()
-    if suffix == ".obj":
-        obj = ObjFile(path, files, images, budget)
-        parts, n_points = obj.parts(), 1
-        n_bare = obj.n_bare
-    elif suffix == ".ply":
-        ply = PlyFile(path, files, images, budget)
-        parts, n_points = ply.parts(), 1
-        n_bare, unknown = ply.n_bare, ply.unknown
-    else:
-        gltf = GltfScene(GltfFile(path, files, budget), images)
-        parts, n_points = gltf.parts(), gltf.n_points
-        n_bare = gltf.n_bare
+    reading = _read_once(path, files, 1)
+    if (factor := reading.images.least_factor()) > 1:
+        # Its textures are smaller this time. Nothing of the first reading is kept meanwhile.
+        del reading
+        files.missing.clear()
+        reading = _read_once(path, files, factor)
+        assert reading.images.least_factor() == 1
+    parts, n_bare, unknown = reading.parts, reading.n_bare, reading.unknown
     if not parts:
-        found = "a point cloud" if n_points else "empty"
+        found = "a point cloud" if reading.n_points else "empty"
         raise SceneError(f"{path} is {found}: it has no faces; export the scan as a mesh of triangles")
     if n_bare:
         hint = f" (it has {', '.join(unknown)}, whose meaning is not known)" if unknown else ""
         warnings.warn(f"{path}: {n_bare} of {len(parts)} parts have no color and are shown gray{hint}", stacklevel=5)
-    notes: dict[str, str | float | int] = {"textures": images.n_decoded}
-    return parts, notes
+    return parts, {"textures": reading.images.n_decoded, "texture_factor": factor}
+
+
+def _read_once(path: Path, files: ScanFiles, factor: int) -> _Reading:
+    budget = Budget(path)
+    images = Images(files, budget, factor)
+    suffix = path.suffix.lower()
+    if suffix == ".obj":
+        obj = ObjFile(path, files, images, budget)
+        return _Reading(images, obj.parts(), 1, obj.n_bare, [])
+    if suffix == ".ply":
+        ply = PlyFile(path, files, images, budget)
+        return _Reading(images, ply.parts(), 1, ply.n_bare, ply.unknown)
+    gltf = GltfScene(GltfFile(path, files, budget), images)
+    return _Reading(images, gltf.parts(), gltf.n_points, gltf.n_bare, [])
 
 
 def _joined(path: Path, parts: list[Part], files: ScanFiles, notes: dict[str, str | float | int]) -> ScanMesh:

@@ -253,11 +253,9 @@ class ObjFile:
             :2
         ] != shape:
             raise self._bad(f"has a map_d {veil.name} of another size or place than its texture; save them alike")
-        if alpha is not None:
-            return alpha
-        if veil.found == texture.found:
-            return np.full(shape, 255, dtype=np.uint8)
-        return np.asarray(np.rint(rgb.mean(axis=2)), dtype=np.uint8)
+        if veil.found == texture.found and alpha is None:
+            return np.broadcast_to(np.uint8(255), shape)
+        return self._images.veil(veil.found)
 
     def _plain(
         self, faces: NDArray[np.int64], colors: NDArray[np.float32] | None, material: Material | None

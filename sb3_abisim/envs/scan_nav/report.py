@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.envs.scan_nav.build import MapSettings, find_floors
 from sb3_abisim.envs.scan_nav.files import SceneError
+from sb3_abisim.envs.scan_nav.images import MAX_KEPT_BYTES
 from sb3_abisim.envs.scan_nav.mesh import ScanMesh
 from sb3_abisim.envs.scan_nav.upright import (
     AXES,
@@ -59,6 +60,7 @@ class ScanReport:
     :param n_faces: that are not transparent
     :param n_transparent: faces that are left out, since one sees through them
     :param n_textures: decoded
+    :param texture_factor: by which their width and height were divided, so that all of them fit into memory
     :param walkable_area: None before the map is made
     :param walkable_share: of the floor that is seen from above
     """
@@ -78,6 +80,7 @@ class ScanReport:
     n_faces: int
     n_transparent: int
     n_textures: int
+    texture_factor: int = 1
     walkable_area: float | None = None
     walkable_share: float | None = None
 
@@ -101,11 +104,14 @@ class ScanReport:
         return found
 
     def json(self) -> dict[str, Any]:
-        """As JSON types, rounded to what is known."""
-        return {name: _rounded(value) for name, value in asdict(self).items()}
+        """As JSON types, rounded to what is known; ``texture_factor`` where textures were reduced alone."""
+        known = {name: _rounded(value) for name, value in asdict(self).items()}
+        if self.texture_factor == 1:
+            del known["texture_factor"]
+        return known
 
     def lines(self, source: str) -> str:
-        """For people, three lines.
+        """For people, three lines, and a fourth where textures were reduced.
 
         :param source: the scan
         """
@@ -120,6 +126,12 @@ class ScanReport:
         unknown = ""
         if self.storey_from == "ceiling" and max(self.standing, self.hanging) <= _HANGING_SHARE * self.floor_area:
             unknown = " (an empty room: whether it stands on its head is not known)"
+        reduced = ""
+        if self.texture_factor > 1:
+            reduced = (
+                f"\n  the width and height of its textures were divided by {self.texture_factor}, since together they "
+                f"would take more than {MAX_KEPT_BYTES >> 20} MiB of memory"
+            )
         east, north, high = self.size
         return (
             f"{source}: {east:.1f} x {north:.1f} x {high:.1f} m, {self.up} up{lean}, {self.n_faces} faces{left_out}, "
@@ -127,7 +139,7 @@ class ScanReport:
             f"  floors at {', '.join(f'{z:z.2f}' for z in self.floors)} m; storey: {storey}; "
             f"{self.floor_area:.1f} m2 of floor{walkable}\n"
             f"  {self.up_share:.0%} of the level faces look up; {max(self.standing, 0):z.1f} m2 stand on the floor, "
-            f"{max(self.hanging, 0):z.1f} m2 hang from the ceiling{unknown}; unit: {self.unit}"
+            f"{max(self.hanging, 0):z.1f} m2 hang from the ceiling{unknown}; unit: {self.unit}{reduced}"
         )
 
 
@@ -209,6 +221,7 @@ def make_report(mesh: ScanMesh, floors: list[float], floor: int) -> ScanReport:
         n_faces=len(mesh.faces),
         n_transparent=int(notes.get("transparent_faces", 0)),
         n_textures=int(notes.get("textures", 0)),
+        texture_factor=int(notes.get("texture_factor", 1)),
     )
 
 
