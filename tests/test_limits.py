@@ -44,7 +44,7 @@ ROWS: dict[str, tuple[dict[str, float], list[str]]] = {
         "envs/scan_nav/test_map.py::test_a_file_that_declares_more_than_a_map_is_refused_before_it_is_unpacked",
     ]),
     "videos": (
-        {"34 million": video_frames.MAX_FRAME_PIXELS, "10,000": video_frames._MAX_PIXELS_PER_BYTE,
+        {"17 million": video_frames.MAX_VIDEO_PIXELS, "10,000": video_frames._MAX_PIXELS_PER_BYTE,
          "2 billion": video_frames._MAX_PIXELS},
         ["envs/backgrounds/test_video_frames.py::test_frames_that_are_too_large_are_refused_before_they_are_decoded",
          "envs/backgrounds/test_video_frames.py::test_more_pixels_than_so_small_a_file_can_hold",

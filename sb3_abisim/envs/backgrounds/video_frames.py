@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     from PIL import Image
 
 
-# Of a frame: 8K video has 33 million.
+# Of an image.
 MAX_FRAME_PIXELS = 34_000_000
+# Of a frame of a video, whose decoder may keep sixteen others; 4K has 9 million.
+MAX_VIDEO_PIXELS = 17_000_000
 # Of all frames of a file together: that many and more by its size, which no encoder comes near.
 _MAX_PIXELS, _MAX_PIXELS_PER_BYTE = 2_000_000_000, 10_000
 # A frame of PyAV and its side data refer to each other: it stays in memory until Python looks for such circles.
@@ -38,7 +40,7 @@ _OPTIONS = {
     "protocol_whitelist": "none",
     "format_whitelist": "mov,matroska,avi,gif,ogg,mpeg,mpegvideo",
     # Larger ones are left without a size, before memory is taken for them.
-    "max_pixels": str(MAX_FRAME_PIXELS),
+    "max_pixels": str(MAX_VIDEO_PIXELS),
 }
 # What is behind a transparent part is not known, and its own color is not meant to be seen.
 _TRANSPARENT = "{path} is transparent in parts; lay it over a color, or remove it"
@@ -182,7 +184,7 @@ def _video_stream(container: Any, path: Path) -> Any:
     # A stream that no decoder is known for has no size at all.
     if not (getattr(streams[0], "width", 0) and getattr(streams[0], "height", 0)):
         raise ClipError(
-            f"{path} has frames of over {MAX_FRAME_PIXELS} pixels, or of a kind that is not known; scale it down: "
+            f"{path} has frames of over {MAX_VIDEO_PIXELS} pixels, or of a kind that is not known; scale it down: "
             f"ffmpeg -i {path.name} -vf scale=640:-2 small.mp4"
         )
     return streams[0]

@@ -153,7 +153,8 @@ class TestDamage:
             load_backgrounds(folder)
 
     def test_frames_that_are_too_large_are_refused_before_they_are_decoded(self, folder, monkeypatch):
-        assert video_frames._OPTIONS["max_pixels"] == str(video_frames.MAX_FRAME_PIXELS)
+        assert video_frames._OPTIONS["max_pixels"] == str(video_frames.MAX_VIDEO_PIXELS)
+        monkeypatch.setattr(video_frames, "MAX_VIDEO_PIXELS", 96 * 72 - 1)
         monkeypatch.setattr(video_frames, "MAX_FRAME_PIXELS", 96 * 72 - 1)
         monkeypatch.setitem(video_frames._OPTIONS, "max_pixels", str(96 * 72 - 1))
         path = write_video(folder / "a.mp4", 1)
