@@ -30,14 +30,15 @@ def rows(folders: list[str], thresholds: tuple[float, ...] = THRESHOLDS) -> list
     :param thresholds: normalized returns
     :raises ValueError: for runs whose jobs do not say how long they and what they were made of took
     """
-    runs = labeled_runs(folders)
     lines = []
-    for env_id, groups in group_runs(runs, "training", runs[0].label, []).items():
-        for label, group in groups.items():
-            cells = [_minutes(group, level, clock) for level in thresholds for clock in CLOCKS]
-            lines.append(
-                f"| {env_id} | `{label}` | {_before(group)} | " + " | ".join(cells) + f" | {len(group.runs)} |"
-            )
+    # One after the other: what does not arrive has more steps, in a folder of its own.
+    for folder in folders:
+        runs = labeled_runs([folder])
+        for env_id, groups in group_runs(runs, "training", runs[0].label, []).items():
+            for label, group in groups.items():
+                cells = [env_id, f"`{label}`", f"{round(group.horizon, -3):,}", _before(group)]
+                cells += [_minutes(group, level, clock) for level in thresholds for clock in CLOCKS]
+                lines.append("| " + " | ".join([*cells, str(len(group.runs))]) + " |")
     return lines
 
 
@@ -48,8 +49,8 @@ def header(thresholds: tuple[float, ...] = THRESHOLDS) -> list[str]:
     """
     names = [f"to {level:.0%}, {name}" for level in thresholds for name in CLOCKS.values()]
     return [
-        "| environment | method | data and encoder, processor | " + " | ".join(names) + " | runs |",
-        "|---|---|" + "---:|" * (len(names) + 2),
+        "| environment | method | steps, about | data and encoder, processor | " + " | ".join(names) + " | runs |",
+        "|---|---|" + "---:|" * (len(names) + 3),
     ]
 
 
