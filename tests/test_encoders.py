@@ -19,16 +19,14 @@ ENV_IDS = (
     "DistractorPointMaze-v0",
     "ContinuousDistractorPointMaze-v0",
 )
-GOAL_PROGRESS = ("Nav2D-v0", "DistractorPointMaze-v0")
 
 
 def test_a_method_ships_for_every_environment_or_for_none():
     found = {(path.parent.name, path.stem) for path in FILES}
-    # ScanNav's are two so far: what the plain zoo command trains on, and its base. Goal progress ships for two so far.
+    # ScanNav's are two so far: what the plain zoo command trains on, and its base.
     partial = {("ScanNav-v0", name) for name in ("ssi", "abisim")}
-    partial |= {(env_id, "goal_progress") for env_id in GOAL_PROGRESS}
-    names = {name for _, name in found} - {"goal_progress"}
-    assert {"ssi", "acro", "beta_vae", "curl", "info_nce", "abisim"} <= names
+    names = {name for _, name in found}
+    assert {"ssi", "acro", "beta_vae", "curl", "info_nce", "abisim", "goal_progress"} <= names
     assert names <= {name for name, method in methods().items() if method.is_pretrained}
     assert found == {(env_id, name) for env_id in ENV_IDS for name in names} | partial
 
