@@ -31,8 +31,8 @@ _WRAPPERS = (
     "shows what the environment renders"
 )
 _FLOATS = (
-    'two wrappers make bytes of these floats: --env-wrapper "gymnasium.wrappers.RescaleObservation: {min_obs: 0, '
-    'max_obs: 255}" "gymnasium.wrappers.DtypeObservation: {dtype: uint8}"'
+    'two wrappers of gymnasium 1.4 make bytes of these floats: --env-wrapper "gymnasium.wrappers.RescaleObservation: '
+    '{min_obs: 0, max_obs: 255}" "gymnasium.wrappers.DtypeObservation: {dtype: uint8}"'
 )
 # Where the channels of an observation are: (C, H, W), (H, W, C) or (H, W).
 FIRST, LAST, NONE = "first", "last", "none"

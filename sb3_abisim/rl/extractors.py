@@ -401,7 +401,7 @@ def _check_space(observation_space: gym.Space[Any]) -> None:
         # What VecNormalize declares goes from -clip_obs to clip_obs.
         if is_float_image_space(observation_space) and observation_space.low.min() >= 0:  # type: ignore[attr-defined]
             remedy = (
-                "two wrappers make bytes of these floats, in a zoo YAML `env_wrapper: "
+                "two wrappers of gymnasium 1.4 make bytes of these floats, in a zoo YAML `env_wrapper: "
                 "[{gymnasium.wrappers.RescaleObservation: {min_obs: 0, max_obs: 255}}, "
                 "{gymnasium.wrappers.DtypeObservation: {dtype: uint8}}]`"
             )

@@ -109,6 +109,8 @@ def commands(folder: Path, kwargs: list[str], params: list[str], algo: str, froz
 
 @pytest.mark.parametrize("name", CASES)
 def test_collect_pretrain_train_evaluate_record(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "DtypeObservation" in str(CASES[name]) and gym.__version__ < "1.4":
+        pytest.skip("gymnasium before 1.4 takes no dtype by name")
     for words in commands(tmp_path, *CASES[name]):
         run(monkeypatch, *words)
     folder = tmp_path / "logs" / CASES[name][2] / "Odd-v0_1"
