@@ -46,7 +46,9 @@ class PlainWrappers:
         if not self._is_plain:
             return False
         for one in self._wrappers:
-            if type(one) is PassiveEnvChecker and not (one.checked_step and one.checked_data_reuse):
+            # Gymnasium before 1.4 checks no reuse of data.
+            reuse_checked = getattr(one, "checked_data_reuse", True)
+            if type(one) is PassiveEnvChecker and not (one.checked_step and reuse_checked):
                 return False
         # Somebody may have put another method into an object.
         return not any("step" in vars(one) for one in (*self._wrappers, self._copy))
