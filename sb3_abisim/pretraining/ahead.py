@@ -24,13 +24,14 @@ def make_ahead(items: Iterator[T]) -> Generator[T, None, None]:
             yield item
 
 
-def gains_from_ahead(device: th.device) -> bool:
+def gains_from_ahead(device: th.device, n_processes: int) -> bool:
     """Whether batches made ahead make training faster: there is a core that the networks leave free.
 
     With networks on one thread of two cores, updates on point mazes were 1.1 to 1.2 times as fast; with networks on
     both, they were slower (benchmarks/bench_ahead.py). On a GPU nobody has measured it; there, networks leave all free.
 
     :param device: of the networks
+    :param n_processes: that pretrain together
     """
     n_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return device.type != "cpu" or (th.get_num_threads() == 1 and n_cores > 1)
+    return device.type != "cpu" or (th.get_num_threads() == 1 and n_cores > n_processes)

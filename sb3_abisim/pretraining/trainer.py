@@ -190,8 +190,10 @@ class PretrainRun:
             mininterval=0.5,
         )
         try:
-            asked_for = self._batches()
-            with contextlib.closing(make_ahead(asked_for) if gains_from_ahead(self.device) else asked_for) as batches:
+            batches = self._batches()
+            if gains_from_ahead(self.device, self.ranks.size):
+                batches = make_ahead(batches)
+            with contextlib.closing(batches):
                 for batch in batches:
                     terms = self._update(batch)
                     for name, value in terms.items():

@@ -67,7 +67,8 @@ def _is_whole(video: bytes) -> bool:
     at, names = 0, set()
     while at < len(video):
         size, name = int.from_bytes(video[at : at + 4]), video[at + 4 : at + 8]
-        at += int.from_bytes(video[at + 8 : at + 16]) if size == 1 else size or len(video)
+        # One without a size goes on to the end; none is shorter than its own size and name.
+        at += max(int.from_bytes(video[at + 8 : at + 16]) if size == 1 else size or len(video), 8)
         names.add(name)
     return at == len(video) and b"moov" in names
 

@@ -72,6 +72,9 @@ def test_pretraining_counts_and_runs_that_do_not_arrive_make_a_bound(
     assert 3 < processor < 3 + 10 and wall == pytest.approx(3 * processor, abs=0.2)
     assert (scratch[2], scratch[4]) == ("`vanilla`", "0.0")
     assert scratch[5].startswith("over ") and scratch[5].endswith(", 1 of 2 runs")
+    # Folders keep their rows, since their runs have other numbers of steps.
+    assert len(times.rows([str(benchmark / "runs")] * 2)) == 4
+    assert (ours[3], scratch[3]) == (f"{round(STEPS[-1], -3):,}",) * 2
     assert (tmp_path / "times.md").read_text().count("\n| PointMaze-v0 |") == 2
     assert "Time to a return" in capsys.readouterr().out
 

@@ -7,11 +7,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import PassiveEnvChecker
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_abisim.envs import ENV_IDS
+from sb3_abisim.envs.plain_wrappers import PlainWrappers
 from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
 
 
@@ -170,6 +172,21 @@ def test_wrappers_are_called_at_the_ends_of_episodes_alone(module: str, monkeypa
         for name in ("rewards", "total_steps", "needs_reset", "episode_returns", "episode_lengths"):
             assert getattr(one, name) == getattr(other, name)
         assert one.get_wrapper_attr("_elapsed_steps") == other.get_wrapper_attr("_elapsed_steps")
+
+
+def test_the_checker_of_gymnasium_before_1_4_has_less_to_check() -> None:
+    env = gym.make("Nav2D-v0")
+    env.reset(seed=0)
+    wrappers = PlainWrappers(env)
+    assert not wrappers.are_plain()
+    for _ in range(3):
+        env.step(0)
+    assert wrappers.are_plain()
+    checker: Any = env
+    while not isinstance(checker, PassiveEnvChecker):
+        checker = checker.env
+    vars(checker).pop("checked_data_reuse", None)
+    assert wrappers.are_plain()
 
 
 class Doubled(gym.RewardWrapper[Any, Any]):

@@ -61,14 +61,28 @@ def test_a_run_is_the_same_to_the_bit(tmp_path: Path, monkeypatch: pytest.Monkey
         return whole(run, batch)
 
     monkeypatch.setattr(trainer.PretrainRun, "_to_tensors", noting)
-    monkeypatch.setattr(trainer, "gains_from_ahead", lambda device: True)
+    monkeypatch.setattr(trainer, "gains_from_ahead", lambda *args: True)
     first = pretrain("ssi", tmp_path / "data", tmp_path / "ahead.safetensors", **settings)
     assert any(name.startswith("batches") for name in made_in)
     made_in.clear()
-    monkeypatch.setattr(trainer, "gains_from_ahead", lambda device: False)
+    monkeypatch.setattr(trainer, "gains_from_ahead", lambda *args: False)
     plain = pretrain("ssi", tmp_path / "data", tmp_path / "plain.safetensors", **settings)
     assert made_in == {threading.current_thread().name}
     assert first.read_bytes() == plain.read_bytes()
+
+
+def test_the_thread_ends_with_a_run_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    collect("Nav2D-v0", 600, tmp_path / "data", n_envs=4)
+
+    def fail(*args: Any) -> None:
+        raise FloatingPointError("no number")
+
+    monkeypatch.setattr(trainer, "gains_from_ahead", lambda *args: True)
+    monkeypatch.setattr(trainer.PretrainRun, "_update", fail)
+    # What was raised holds on to the loop.
+    with pytest.raises(FloatingPointError) as raised:
+        pretrain("ssi", tmp_path / "data", tmp_path / "x.safetensors", progress_bar=False, verbose=0, device="cpu")
+    assert raised and not [one for one in threading.enumerate() if one.name.startswith("batches")]
 
 
 def test_a_core_must_be_free(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,8 +90,9 @@ def test_a_core_must_be_free(monkeypatch: pytest.MonkeyPatch) -> None:
     for n_threads, cores, gains in ((1, {0, 1}, True), (1, {0}, False), (2, {0, 1}, False), (8, set(range(16)), False)):
         monkeypatch.setattr(th, "get_num_threads", lambda n=n_threads: n)
         monkeypatch.setattr(ahead.os, "sched_getaffinity", lambda pid, cores=cores: cores, raising=False)
-        assert ahead.gains_from_ahead(cpu) == gains, (n_threads, cores)
-        assert ahead.gains_from_ahead(th.device("cuda"))
+        assert ahead.gains_from_ahead(cpu, 1) == gains, (n_threads, cores)
+        assert not ahead.gains_from_ahead(cpu, len(cores)), "each process has its core"
+        assert ahead.gains_from_ahead(th.device("cuda"), 1)
 
 
 def test_a_dataset_is_read_by_one_thread_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

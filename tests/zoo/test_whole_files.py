@@ -126,3 +126,5 @@ def test_half_a_video_is_told_from_a_whole_one(tmp_path: Path) -> None:
     assert _is_whole(content)
     for size in (0, 7, 40, len(content) // 2, len(content) - 1):
         assert not _is_whole(content[:size])
+    # A length that is none ends, too.
+    assert not _is_whole(b"\0\0\0\1mdat" + bytes(20))
