@@ -14,7 +14,7 @@ from sb3_abisim.networks.base import default_network, make_encoder
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.registry import get_method, methods, networks
 
-MIN_SIZES = {"nature": 36, "impala": 8, "resnet18": 16, "small": 3}
+MIN_SIZES = {"nature": 36, "impala": 8, "resnet18": 16, "small": 3, "glimpse": 16}
 OBJECTIVES = [name for name, method in methods().items() if method.objective is not None]
 
 
@@ -110,7 +110,13 @@ def test_default_networks(shape: tuple[int, ...], name: str) -> None:
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize(
     ("network", "shape"),
-    [("nature", (4, 37, 44)), ("impala", (1, 21, 9)), ("resnet18", (12, 17, 33)), ("small", (3, 7, 11))],
+    [
+        ("nature", (4, 37, 44)),
+        ("impala", (1, 21, 9)),
+        ("resnet18", (12, 17, 33)),
+        ("small", (3, 7, 11)),
+        ("glimpse", (4, 33, 21)),
+    ],
 )
 def test_every_objective_trains_on_them(objective: str, network: str, shape: tuple[int, ...]) -> None:
     """One step moves every weight of the encoder, and the decoder reaches odd sizes."""
