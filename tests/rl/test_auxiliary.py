@@ -434,15 +434,24 @@ def test_settings_come_from_pretraining_where_none_are_given() -> None:
     assert AuxiliaryObjective("recorder")._settings(None)[0] is None
 
 
+PAGE = (Path(__file__).parents[2] / "docs" / "while_rl_runs.md").read_text(encoding="utf-8")
+
+
 def test_the_example_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "while_rl_runs.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     (code,) = [block for block in blocks if "AuxiliaryObjective" in block]
     assert len(code.splitlines()) <= 10
     assert "100_000" in code
     monkeypatch.chdir(tmp_path)
     exec(code.replace("100_000", "1_000"), {})
     assert KEY in "".join(sb3.PPO.load("agent").policy.state_dict())
+
+
+def test_the_example_of_a_learning_rate_runs_to_its_end() -> None:
+    """As there, the last rollout goes beyond the steps asked for."""
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "encoder_lr=" in block]
+    assert "100_000" in code
+    exec(code.replace("100_000", "100").replace("policy_kwargs=", "n_steps=64, policy_kwargs=", 1), {})
 
 
 @pytest.mark.parametrize(("kwargs", "message"), [
