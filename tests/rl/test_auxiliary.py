@@ -11,7 +11,8 @@ import stable_baselines3 as sb3
 import torch as th
 from auxiliary_inputs import FEW_GOALS, SMALL, Recorder, build, make_envs, register_inputs
 from extractor_inputs import ALGORITHMS, SHARING, write
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.registry import get_objective, methods
@@ -491,8 +492,28 @@ def test_other_extractors_are_refused() -> None:
 
 def test_two_of_them_are_refused() -> None:
     model = build("PPO")
-    with pytest.raises(ValueError, match="two auxiliary objectives, ssi and curl"):
-        model.learn(16, CallbackList([AuxiliaryObjective("ssi"), CallbackList([AuxiliaryObjective("curl")])]))
+    ssi = AuxiliaryObjective("ssi")
+    for second, name in ((CallbackList([AuxiliaryObjective("curl")]), "curl"), (ssi, "ssi")):
+        with pytest.raises(ValueError, match=f"two auxiliary objectives, ssi and {name}"):
+            model.learn(16, CallbackList([ssi, second]))
+
+
+@pytest.mark.parametrize("callback_class", [AuxiliaryObjective, EncoderCallback])
+def test_within_a_callback_of_some_steps_it_is_refused(callback_class: type[BaseCallback]) -> None:
+    """Rollouts would begin and end without it, and it would do nothing."""
+    name = callback_class.__name__
+    with pytest.raises(ValueError, match=f"{name} within EveryNTimesteps .* give both to learn in one list"):
+        build("PPO").learn(16, EveryNTimesteps(4, CallbackList([callback_class()])))
+    evaluation = EvalCallback(make_envs(1), callback_on_new_best=callback_class(), verbose=0)
+    with pytest.raises(ValueError, match=f"{name} within EvalCallback"):
+        build("PPO").learn(16, evaluation)
+
+
+def test_actions_that_do_not_begin_at_0_are_refused() -> None:
+    env = make_envs(2)
+    env.action_space = spaces.Discrete(3, start=5)
+    with pytest.raises(ValueError, match=r"counts actions from 0, .*Discrete\(3, start=5\).*TransformAction"):
+        build("PPO", env).learn(16, AuxiliaryObjective("ssi"))
 
 
 def test_an_encoder_in_the_environment_is_refused(tmp_path: Any) -> None:
