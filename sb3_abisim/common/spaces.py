@@ -145,6 +145,19 @@ def fit_actions(actions: Any, space: gym.Space[Any], where: str) -> NDArray[Any]
     return array if dtype.kind == "f" else array.astype(dtype)
 
 
+def require_actions_from_0(space: gym.Space[Any]) -> None:
+    """Refuse numbers of actions that begin elsewhere: environments would get others than Stable-Baselines3 means.
+
+    :param space: of one action
+    :raises ValueError: naming the remedy
+    """
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and np.any(space.start != 0):
+        raise ValueError(
+            f"Stable-Baselines3 counts actions from 0, and these do not: {space}; register a variant of the "
+            "environment in gymnasium.wrappers.TransformAction"
+        )
+
+
 def executed_actions(space: gym.Space[Any], stored: NDArray[Any], scaled: bool, clipped: bool) -> NDArray[Any]:
     """The actions that the environments got, of those that Stable-Baselines3's buffers hold.
 

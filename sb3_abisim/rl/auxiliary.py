@@ -13,10 +13,17 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 
 from sb3_abisim.common.arguments import checked_arguments
 from sb3_abisim.common.method_settings import settings_entry
+from sb3_abisim.common.spaces import require_actions_from_0
 from sb3_abisim.registry import get_method, get_objective
 from sb3_abisim.rl.auxiliary_data import ReplaySteps, RolloutHistory, RolloutSteps, Steps, read_rollout
 from sb3_abisim.rl.auxiliary_trainer import N_PREPARE, AuxiliarySettings, AuxiliaryTrainer
-from sb3_abisim.rl.checks import find_extractors, image_keys, require_weights
+from sb3_abisim.rl.checks import (
+    find_extractors,
+    image_keys,
+    nested_callbacks,
+    require_every_event,
+    require_weights,
+)
 from sb3_abisim.rl.extractors import BaseEncoderExtractor
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
 
@@ -92,8 +99,14 @@ class AuxiliaryObjective(BaseCallback):
         self.objective_kwargs, self.base_kwargs = objective_kwargs or {}, base_kwargs or {}
         self._trainers: dict[str, AuxiliaryTrainer] = {}
 
+    def _init_callback(self) -> None:
+        require_every_event(self)
+
     def _on_training_start(self) -> None:
+        # A list tells its callbacks their parent after their init.
+        require_every_event(self)
         require_weights(self.model)
+        require_actions_from_0(self.model.action_space)
         self._refuse_another(self.locals.get("callback"))
         extractors = trained_extractors(self.model, self.training_env, self.weight)
         seed = self.model.seed if self.seed is None else self.seed
@@ -139,11 +152,12 @@ class AuxiliaryObjective(BaseCallback):
             base_kwargs={**base_known, **self.base_kwargs},
         )
 
-    def _refuse_another(self, callback: Any) -> None:
-        others = [found for found in _nested(callback) if isinstance(found, AuxiliaryObjective) and found is not self]
-        if others:
+    @staticmethod
+    def _refuse_another(callback: Any) -> None:
+        given = [found for found in nested_callbacks(callback) if isinstance(found, AuxiliaryObjective)]
+        if len(given) > 1:
             raise ValueError(
-                f"there are two auxiliary objectives, {self.objective} and {others[0].objective}, for the same "
+                f"there are two auxiliary objectives, {given[0].objective} and {given[1].objective}, for the same "
                 "encoder; give one"
             )
 
@@ -254,12 +268,6 @@ def trained_extractors(
             "(in the zoo ,frozen) out, or give weight=0, which measures only"
         )
     return found
-
-
-def _nested(callback: Any) -> list[Any]:
-    """A callback and all within it."""
-    inner = getattr(callback, "callbacks", None) or [getattr(callback, "callback", None)]
-    return [callback, *(found for child in inner if child is not None for found in _nested(child))]
 
 
 def _env_id(env: VecEnv) -> str | None:

@@ -8,7 +8,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import unwrap_vec_wrapper
 
 from sb3_abisim.common.malloc import keep_freed_memory
-from sb3_abisim.rl.checks import check_eval_envs, find_extractors, require_weights
+from sb3_abisim.rl.checks import (
+    check_eval_envs,
+    find_extractors,
+    nested_callbacks,
+    require_every_event,
+    require_weights,
+)
 from sb3_abisim.rl.fine_tuning import FineTuning, Schedule
 from sb3_abisim.rl.unfreeze import require_unfreezable, unfreeze_encoder
 from sb3_abisim.rl.vec_encode import EncodedBox, VecEncodeObservations
@@ -36,7 +42,8 @@ class EncoderCallback(BaseCallback):
         after it trains the encoder; None never unfreezes
     :param encoder_trained_by: "critic" lets the critic's loss train an encoder that actor and critic of SAC, TD3 or TQC
         share; None leaves it to the actor's, as Stable-Baselines3 does
-    :raises ValueError: for an argument of another form
+    :raises ValueError: for an argument of another form, or within a callback that passes on some steps alone, such as
+        ``EveryNTimesteps``
     :raises FileNotFoundError: when training starts, if an encoder has no weights because its file was not found
     :raises ValueError: when training starts, if the model was trained on the embeddings of another encoder, or an
         ``EvalCallback`` beside this one has another encoder or preprocessing, or the algorithm or its encoders do not
@@ -57,7 +64,12 @@ class EncoderCallback(BaseCallback):
         self.unfreeze_at = unfreeze_at
         self._fine_tuning = FineTuning(encoder_lr, encoder_lr_factor, encoder_trained_by)
 
+    def _init_callback(self) -> None:
+        require_every_event(self)
+
     def _on_training_start(self) -> None:
+        # A list tells its callbacks their parent after their init.
+        require_every_event(self)
         keep_freed_memory()
         require_weights(self.model)
         self._require_alone()
@@ -135,11 +147,7 @@ class EncoderCallback(BaseCallback):
 
     def _require_alone(self) -> None:
         """Refuse a second callback of this class: which one's arguments would hold?"""
-        found, pending = 0, [self.locals.get("callback")]
-        while pending:
-            callback = pending.pop()
-            found += isinstance(callback, EncoderCallback)
-            pending += getattr(callback, "callbacks", None) or filter(None, [getattr(callback, "callback", None)])
+        found = sum(isinstance(callback, EncoderCallback) for callback in nested_callbacks(self.locals.get("callback")))
         if found > 1:
             raise ValueError(f"{found} callbacks are {type(self).__name__}s; give one, with all arguments")
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 from torch import nn
 
@@ -85,6 +86,28 @@ def _parts(extractor: Any, kwargs: Mapping[str, Any]) -> list[_Part]:
     ]
 
 
+def nested_callbacks(callback: Any) -> list[Any]:
+    """A callback and all within it; one that is given twice is there twice.
+
+    :param callback: of ``learn``
+    """
+    inner = getattr(callback, "callbacks", None) or [getattr(callback, "callback", None)]
+    return [callback, *(found for child in inner if child is not None for found in nested_callbacks(child))]
+
+
+def require_every_event(callback: BaseCallback) -> None:
+    """Refuse a callback within one that passes on some steps, and no beginning and end of a rollout.
+
+    :param callback: that needs all of them
+    :raises ValueError: naming the other one
+    """
+    if isinstance(callback.parent, EventCallback):
+        raise ValueError(
+            f"{type(callback).__name__} within {type(callback.parent).__name__} would see some steps only; give both "
+            "to learn in one list"
+        )
+
+
 def check_eval_envs(training_env: VecEnv, callback: Any) -> None:
     """Refuse evaluation environments whose observations were made in another way than those of training.
 
@@ -95,12 +118,13 @@ def check_eval_envs(training_env: VecEnv, callback: Any) -> None:
     :param callback: of ``learn``; those within it are looked at, too
     :raises ValueError: with both sides
     """
-    for child in getattr(callback, "callbacks", None) or [getattr(callback, "callback", None)]:
-        if child is not None:
-            check_eval_envs(training_env, child)
-    eval_env = getattr(callback, "eval_env", None)
-    if not isinstance(eval_env, VecEnv):
-        return
+    for each in nested_callbacks(callback):
+        eval_env = getattr(each, "eval_env", None)
+        if isinstance(eval_env, VecEnv):
+            _check_eval_env(training_env, each, eval_env)
+
+
+def _check_eval_env(training_env: VecEnv, callback: Any, eval_env: VecEnv) -> None:
     (layers, wrappers), (their_layers, their_wrappers) = _preprocessing(training_env), _preprocessing(eval_env)
     differ = wrappers is not None and their_wrappers is not None and wrappers != their_wrappers
     if layers != their_layers or differ:

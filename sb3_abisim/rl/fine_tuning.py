@@ -22,7 +22,7 @@ def make_schedule(value: float | str | Schedule, name: str) -> Schedule:
     """A schedule in any of rl-zoo3's and Stable-Baselines3's forms.
 
     :param value: a number above 0, ``lin_NUMBER``, which falls to 0 in a straight line, or a function of the remaining
-        progress (1 at the start, 0 at the end)
+        progress (1 at the start, 0 at the end and in what a last rollout has beyond it)
     :param name: of the setting, for messages
     :raises ValueError: for anything else
     """
@@ -134,11 +134,13 @@ class FineTuning:
 
     def _rate(self, model: BaseAlgorithm, lr: float) -> float:
         assert self._schedule is not None
-        value = float(self._schedule(model._current_progress_remaining))
+        # The last rollout may go beyond the steps asked for, where Stable-Baselines3's progress is negative.
+        progress = max(model._current_progress_remaining, 0.0)
+        value = float(self._schedule(progress))
         if not (value >= 0 and math.isfinite(value)):
             raise ValueError(
-                f"{self._rate_name} is {value} at remaining progress {model._current_progress_remaining:g}; let its "
-                "schedule give finite numbers that are not negative"
+                f"{self._rate_name} is {value} at remaining progress {progress:g}; let its schedule give finite "
+                "numbers that are not negative"
             )
         rate = value if self._rate_name == "encoder_lr" else lr * value
         model.logger.record("encoder/learning_rate", rate)

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_abisim.common.spaces import is_channels_first
+from sb3_abisim.common.spaces import is_channels_first, require_actions_from_0
 
 _NUMBERS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 
@@ -19,12 +19,8 @@ def check_spaces(env: gym.Env[Any, Any], frame_stack: int | None) -> None:
     :param frame_stack: of the zoo's entry
     :raises ValueError: naming what is wrong, and the remedy
     """
-    space, actions = env.observation_space, env.action_space
-    if isinstance(actions, spaces.Discrete | spaces.MultiDiscrete) and np.any(actions.start != 0):
-        raise ValueError(
-            f"Stable-Baselines3 counts actions from 0, and these do not: {actions}; register a variant of the "
-            "environment in gymnasium.wrappers.TransformAction"
-        )
+    space = env.observation_space
+    require_actions_from_0(env.action_space)
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     for stacked, taken in ((False, _NUMBERS), (True, spaces.Box)):
         others = {key: part for key, part in parts.items() if not isinstance(part, taken)}

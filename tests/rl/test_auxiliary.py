@@ -11,7 +11,8 @@ import stable_baselines3 as sb3
 import torch as th
 from auxiliary_inputs import FEW_GOALS, SMALL, Recorder, build, make_envs, register_inputs
 from extractor_inputs import ALGORITHMS, SHARING, write
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 
 from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.registry import get_objective, methods
@@ -434,15 +435,24 @@ def test_settings_come_from_pretraining_where_none_are_given() -> None:
     assert AuxiliaryObjective("recorder")._settings(None)[0] is None
 
 
+PAGE = (Path(__file__).parents[2] / "docs" / "while_rl_runs.md").read_text(encoding="utf-8")
+
+
 def test_the_example_of_the_docs_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "while_rl_runs.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     (code,) = [block for block in blocks if "AuxiliaryObjective" in block]
     assert len(code.splitlines()) <= 10
     assert "100_000" in code
     monkeypatch.chdir(tmp_path)
     exec(code.replace("100_000", "1_000"), {})
     assert KEY in "".join(sb3.PPO.load("agent").policy.state_dict())
+
+
+def test_the_example_of_a_learning_rate_runs_to_its_end() -> None:
+    """As there, the last rollout goes beyond the steps asked for."""
+    (code,) = [block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "encoder_lr=" in block]
+    assert "100_000" in code
+    exec(code.replace("100_000", "100").replace("policy_kwargs=", "n_steps=64, policy_kwargs=", 1), {})
 
 
 @pytest.mark.parametrize(("kwargs", "message"), [
@@ -482,8 +492,28 @@ def test_other_extractors_are_refused() -> None:
 
 def test_two_of_them_are_refused() -> None:
     model = build("PPO")
-    with pytest.raises(ValueError, match="two auxiliary objectives, ssi and curl"):
-        model.learn(16, CallbackList([AuxiliaryObjective("ssi"), CallbackList([AuxiliaryObjective("curl")])]))
+    ssi = AuxiliaryObjective("ssi")
+    for second, name in ((CallbackList([AuxiliaryObjective("curl")]), "curl"), (ssi, "ssi")):
+        with pytest.raises(ValueError, match=f"two auxiliary objectives, ssi and {name}"):
+            model.learn(16, CallbackList([ssi, second]))
+
+
+@pytest.mark.parametrize("callback_class", [AuxiliaryObjective, EncoderCallback])
+def test_within_a_callback_of_some_steps_it_is_refused(callback_class: type[BaseCallback]) -> None:
+    """Rollouts would begin and end without it, and it would do nothing."""
+    name = callback_class.__name__
+    with pytest.raises(ValueError, match=f"{name} within EveryNTimesteps .* give both to learn in one list"):
+        build("PPO").learn(16, EveryNTimesteps(4, CallbackList([callback_class()])))
+    evaluation = EvalCallback(make_envs(1), callback_on_new_best=callback_class(), verbose=0)
+    with pytest.raises(ValueError, match=f"{name} within EvalCallback"):
+        build("PPO").learn(16, evaluation)
+
+
+def test_actions_that_do_not_begin_at_0_are_refused() -> None:
+    env = make_envs(2)
+    env.action_space = spaces.Discrete(3, start=5)
+    with pytest.raises(ValueError, match=r"counts actions from 0, .*Discrete\(3, start=5\).*TransformAction"):
+        build("PPO", env).learn(16, AuxiliaryObjective("ssi"))
 
 
 def test_an_encoder_in_the_environment_is_refused(tmp_path: Any) -> None:

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import stable_baselines3 as sb3
 import torch as th
 from auxiliary_inputs import (
     ACTION,
@@ -11,6 +13,7 @@ from auxiliary_inputs import (
     ENDED,
     EPISODE,
     STEP,
+    CountingEnv,
     Recorder,
     action_code,
     build,
@@ -18,10 +21,12 @@ from auxiliary_inputs import (
     register_inputs,
 )
 from extractor_inputs import ALGORITHMS
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import CallbackList
-from stable_baselines3.common.vec_env import VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecFrameStack, VecNormalize
 
+from sb3_abisim.objectives.base import TensorBatch
 from sb3_abisim.rl.auxiliary import AuxiliaryObjective
 from sb3_abisim.rl.auxiliary_data import ReplaySteps, RolloutHistory, RolloutSteps, Steps, sample_batch
 from sb3_abisim.rl.combined import CombinedEncoderExtractor
@@ -123,6 +128,53 @@ def test_other_replay_buffers(kwargs: dict[str, Any], k: int) -> None:
         assert (action_code(actions) == next_obs[:, ACTION]).all()
     # With one array, the next episode's first observation has taken the place of the last one.
     assert next_obs[:, ENDED].any() == ("n_steps" in kwargs)
+
+
+class GoalEnv(CountingEnv):
+    """As a task of goals, of which hindsight makes others."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(as_dict=True, **kwargs)
+        image, goal = self.observation_space["camera"], spaces.Box(-1, 1, (2,))
+        self.observation_space = spaces.Dict({"observation": image, "achieved_goal": goal, "desired_goal": goal})
+
+    def _observe(self) -> Any:
+        observation = super()._observe()
+        goals = dict.fromkeys(("achieved_goal", "desired_goal"), observation["speed"])
+        return {"observation": observation["camera"], **goals}
+
+    def compute_reward(self, achieved: Any, desired: Any, infos: Any) -> Any:
+        return -np.linalg.norm(achieved - desired, axis=-1)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_hindsight(k: int) -> None:
+    """Its buffer makes other goals, and the images are those that were seen."""
+    kwargs = {"encoders": {"observation": None}, "networks": {"observation": {"network": "Flat"}}}
+    env = DummyVecEnv([lambda first=first: gym.wrappers.TimeLimit(GoalEnv(first=first), 5) for first in (0, 128)])
+    model = build(
+        "DQN", env, buffer_size=60, learning_starts=20, replay_buffer_class=sb3.HerReplayBuffer,
+        replay_buffer_kwargs={"n_sampled_goal": 2}, features_extractor_class=CombinedEncoderExtractor,
+        features_extractor_kwargs=kwargs,
+    )  # fmt: skip
+    model.learn(400, AuxiliaryObjective("recorder", update_interval=4, batch_size=16, k=k))
+    require_true_transitions(k, False, limit=5)
+
+
+@pytest.mark.parametrize("name", ["PPO", "DQN"])
+def test_stacked_frames(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stack of an episode's last observation holds the frames before it, and none of the next episode."""
+    # Stable-Baselines3 takes the shortest side for the channels.
+    monkeypatch.setattr("auxiliary_inputs.SHAPE", (4, 9, 10))
+    model = build(name, VecFrameStack(make_envs(2), 2, channels_order="first"))
+    model.learn(600, AuxiliaryObjective("recorder", update_interval=8, batch_size=64))
+    n = 4
+    for batch in Recorder.batches:
+        before, after = batch.obs, batch.next_obs
+        assert th.equal(after[:, :n], before[:, n:])
+    newest = [TensorBatch.of(b.obs[:, n:], b.actions, b.next_obs[:, n:]) for b in Recorder.batches]
+    Recorder.batches[:] = newest
+    require_true_transitions(1, False, limit=5)
 
 
 @pytest.mark.parametrize("shared", [False, True])

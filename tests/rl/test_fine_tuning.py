@@ -97,6 +97,16 @@ def test_each_optimizer(path: Path, name: str, optimizer: Any) -> None:
     check(model, recorded(model, encoder_lr_factor=0.1), lambda _, lr: lr * 0.1)
 
 
+@pytest.mark.parametrize("name", ["encoder_lr", "encoder_lr_factor"])
+def test_a_schedule_ends_at_0_where_the_last_rollout_goes_beyond_the_end(path: Path, name: str) -> None:
+    model = make("PPO", path)
+    steps = recorded(model, 20, **{name: "lin_0.5"})
+    assert steps[-1][0] < 0, "rollouts of 8 steps"
+    of_encoder = [rates[i] for progress, rates in steps for i in encoder_ids(model)]
+    assert of_encoder[0] > 0
+    assert of_encoder[-1] == 0
+
+
 @pytest.mark.parametrize("name, other_sharing", WITH_OPTIMIZER)
 def test_each_algorithm(path: Path, name: str, other_sharing: bool) -> None:
     model = make(name, path, sharing=other_sharing)
