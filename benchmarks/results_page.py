@@ -105,8 +105,13 @@ def _steps(cell: Cell) -> str:
     n_reached = int((~np.isnan(steps)).sum())
     if not n_reached:
         return f"not within {horizon:,}"
-    text = f"{round(float(np.nan_to_num(steps, nan=horizon).mean()), -3):,.0f}"
-    return text if n_reached == len(steps) else f"over {text}: {n_reached} of {len(steps)} runs reach it"
+    if n_reached < len(steps):
+        # Runs that did not get there within their budget would need longer: a bound, without an interval.
+        mean = float(np.nan_to_num(steps, nan=horizon).mean())
+        return f"over {round(mean, -3):,.0f}: {n_reached} of {len(steps)} runs reach it"
+    means, halves = statistics.mean_and_interval(steps[:, None])
+    text = f"{round(float(means[0]), -3):,.0f}"
+    return text if len(steps) == 1 else f"{text} ± {round(float(halves[0]), -3):,.0f}"
 
 
 def _ratio(cell: Cell) -> str:
