@@ -8,6 +8,7 @@ from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
 from sb3_abisim.common.spaces import is_channels_first
+from sb3_abisim.envs.plain_actions import PLAIN_ACTIONS, is_plain
 
 _NUMBERS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 
@@ -20,10 +21,10 @@ def check_spaces(env: gym.Env[Any, Any], frame_stack: int | None) -> None:
     :raises ValueError: naming what is wrong, and the remedy
     """
     space, actions = env.observation_space, env.action_space
-    if isinstance(actions, spaces.Discrete | spaces.MultiDiscrete) and np.any(actions.start != 0):
+    if not is_plain(actions):
         raise ValueError(
-            f"Stable-Baselines3 counts actions from 0, and these do not: {actions}; register a variant of the "
-            "environment in gymnasium.wrappers.TransformAction"
+            f"Stable-Baselines3 takes actions that count from 0 and lie in one row, and these do not: {actions}; add "
+            f"-params env_wrapper:{PLAIN_ACTIONS}, after other wrappers if there are any"
         )
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     for stacked, taken in ((False, _NUMBERS), (True, spaces.Box)):
