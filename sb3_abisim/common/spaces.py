@@ -26,7 +26,15 @@ def is_float_image_space(space: gym.Space[Any]) -> bool:
 
     :param space: of observations
     """
-    return isinstance(space, spaces.Box) and space.dtype.kind == "f" and len(space.shape) == 3 and space.is_bounded()
+    return is_bounded_image_space(space) and np.dtype(space.dtype).kind == "f"
+
+
+def is_bounded_image_space(space: gym.Space[Any]) -> bool:
+    """Whether observations are images of any numbers between declared bounds.
+
+    :param space: of observations
+    """
+    return isinstance(space, spaces.Box) and len(space.shape) == 3 and 0 not in space.shape and space.is_bounded()
 
 
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
