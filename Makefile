@@ -35,14 +35,18 @@ $(VENV)-lowest/.installed: setup.cfg constraints-lowest.txt
 	$(VENV)-lowest/bin/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -c constraints-lowest.txt -e '.[tests]'
 	@touch $@
 
+# The tests that need more packages than [tests] has.
+TESTS_OF_OTHERS := tests/data/test_vectorized.py tests/envs/test_vector_env_adapter.py tests/networks/test_timm_backbones.py
+
 # dm_control does not load beside MuJoCo 4. It renders through EGL (on Debian, libegl1).
-test-envs: $(VENV)-envs/.installed  ## the three commands on environments of other packages; half an hour
+test-envs: $(VENV)-envs/.installed  ## the three commands on environments of other packages, and tests with these and timm; half an hour
+	OMP_NUM_THREADS=1 $(VENV)-envs/bin/python -m pytest $(TESTS_OF_OTHERS)
 	MUJOCO_GL=egl $(VENV)-envs/bin/python -m benchmarks.any_pixels
 
 $(VENV)-envs/.installed: setup.cfg
 	$(PYTHON) -m venv $(VENV)-envs
 	$(VENV)-envs/bin/python -m pip install --disable-pip-version-check $(PIP_FLAGS) -e . \
-		ale-py 'gymnasium[box2d]' dm_control minigrid opencv-python-headless shimmy 'mujoco<4'
+		ale-py 'gymnasium[box2d]' dm_control minigrid opencv-python-headless pytest shimmy timm 'mujoco<4'
 	@touch $@
 
 test-slow: setup  ## the tests that take minutes

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sb3_abisim.data.importing import import_dataset
     from sb3_abisim.data.writer import Segment, write_dataset
     from sb3_abisim.envs.base import BatchEnv, SingleEnv
+    from sb3_abisim.envs.plain_actions import PlainActions
     from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
     from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
     from sb3_abisim.networks.base import Encoder
@@ -55,6 +56,7 @@ _PUBLIC = {
     "EncoderCallback": "rl.callbacks",
     "EncoderExtractor": "rl.extractors",
     "Objective": "objectives.base",
+    "PlainActions": "envs.plain_actions",
     "PointMazePixels": "envs.point_maze.pixel_wrapper",
     "Segment": "data.writer",
     "SingleEnv": "envs.base",
@@ -87,6 +89,7 @@ __all__ = [
     "EncoderExtractor",
     "EnvTraits",
     "Objective",
+    "PlainActions",
     "PointMazePixels",
     "Segment",
     "SingleEnv",

@@ -22,6 +22,16 @@ def test_constraints_are_the_lower_bounds() -> None:
         assert Requirement(f"{name}=={bounds[name]}").specifier.contains(version), (name, version, bounds[name])
 
 
+def test_tests_of_packages_beyond_the_extra_run_in_ci() -> None:
+    """Elsewhere they are skipped."""
+    skips = re.compile(r'importorskip\("ale_py"|^ +import timm$', re.MULTILINE)
+    paths = sorted((ROOT / "tests").rglob("test_*.py"))
+    names = [str(path.relative_to(ROOT)) for path in paths if skips.search(path.read_text(encoding="utf-8"))]
+    makefile = (ROOT / "Makefile").read_text()
+    assert names and f"TESTS_OF_OTHERS := {' '.join(names)}\n" in makefile
+    assert "-envs/bin/python -m pytest $(TESTS_OF_OTHERS)\n" in makefile
+
+
 def test_both_ends_run_in_ci() -> None:
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
     assert jobs["test"]["strategy"]["matrix"]["target"] == ["test", "test-lowest"]

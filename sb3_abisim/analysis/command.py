@@ -124,6 +124,8 @@ def _figure_parser(name: str) -> argparse.ArgumentParser:
 
 def _figure(args: argparse.Namespace) -> None:
     one = FIGURES[args.name]
+    if getattr(args, "data", None) is None:
+        one.require(args.env)
     trained = _trained(args)
     files = {}
     if one.encoders:

@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from sb3_abisim.analysis import curves, leak, neighbors, perturbation, pixels, plots, plots_pixels, probes, sweep
+from sb3_abisim.analysis.nav2d_exact import check_nav2d
 from sb3_abisim.analysis.scenes import eval_settings, preprocessing_of
 from sb3_abisim.common.files import write_atomic
 from sb3_abisim.common.paths import resource_path
@@ -37,6 +38,7 @@ class Figure:
     :param trained: whether encoders of a custom folder join the shipped ones by default
     :param encoders: whether it looks at encoders at all
     :param as_pretrained: whether encoders are shown what they have recorded: wrappers, stacks, the image of a Dict
+    :param require: refuses environments that it cannot be made of, before anything is loaded
     :param of_data: from a dataset's folder and size to the numbers, in place of new episodes; None where there is no
         such way
     """
@@ -50,26 +52,28 @@ class Figure:
     trained: bool = False
     encoders: bool = True
     as_pretrained: bool = False
+    require: Callable[[str], None] = lambda env_id: None
     of_data: Callable[[Path, int], dict[str, Any]] | None = None
 
 
 FIGURES = {
     "perturbation": Figure(
         "perturbation maps on Nav2D: single-step and multi-step", ("Nav2D-v0",), 10, "layouts, four seconds each",
-        perturbation.nav2d_maps, plots.plot_maps,
+        perturbation.nav2d_maps, plots.plot_maps, require=check_nav2d,
     ),
     "near-far": Figure(
         "violins of near and far obstacles on Nav2D, with the regions", ("Nav2D-v0",), 1000, "layouts",
-        perturbation.near_and_far, plots.plot_near_and_far,
+        perturbation.near_and_far, plots.plot_near_and_far, require=check_nav2d,
     ),
     "structures": Figure(
         "sensitivity within and beyond the reachable part of corridor and maze",
         ("Nav2DCorridor-v0", "Nav2DMaze-v0"), 8, "layouts", perturbation.structure_maps, plots.plot_structures,
-        trained=True,
+        trained=True, require=check_nav2d,
     ),
     "pixels": Figure(
         "perturbation maps of the point mazes: an obstacle moved, the clip swapped",
         ("PointMaze-v0", "DistractorPointMaze-v0"), 1500, "states", pixels.pixel_maps, plots_pixels.plot_pixel_maps,
+        require=pixels.check_point_maze,
     ),
     "neighbors": Figure(
         "nearest neighbors in embedding space", ("DistractorPointMaze-v0",), 500, "episodes", neighbors.neighbors,

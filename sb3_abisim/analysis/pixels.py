@@ -63,6 +63,20 @@ def swapped_backgrounds(samples: Samples, generator: np.random.Generator) -> NDA
     return clips.frames(clip, generator.integers(0, clips.lengths[clip]))
 
 
+def check_point_maze(env_id: str) -> None:
+    """Refuse environments whose obstacles cannot be moved.
+
+    :param env_id: an id of a point maze
+    :raises ValueError: for any other, or one whose goal is not in the center
+    """
+    found = batch_class(env_id)
+    if found is None or not issubclass(found, PointMazeVectorEnv):
+        raise ValueError(
+            f"obstacles can be moved in the point mazes alone, got {env_id!r}; give an id of one such as PointMaze-v0"
+        )
+    check_centered(env_id)
+
+
 def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: int = 0) -> dict[str, Any]:
     """Mean change of the embedding by where the moved obstacle is, and what other changes do.
 
@@ -75,12 +89,7 @@ def pixel_maps(files: dict[str, EncoderFile], env_id: str, n_states: int, seed: 
         (:data:`BINS`), ``agent``, and ``clip`` (None without clips)
     :raises ValueError: for another environment, or too few states
     """
-    found = batch_class(env_id)
-    if found is None or not issubclass(found, PointMazeVectorEnv):
-        raise ValueError(
-            f"obstacles can be moved in the point mazes alone, got {env_id!r}; give an id of one such as PointMaze-v0"
-        )
-    check_centered(env_id)
+    check_point_maze(env_id)
     if n_states < 2:
         raise ValueError(f"distances between states need two states or more, got {n_states}")
     encoders: dict[str, Any] = {name: {"hash": file.hash, "settings": {}} for name, file in files.items()}

@@ -26,7 +26,15 @@ def is_float_image_space(space: gym.Space[Any]) -> bool:
 
     :param space: of observations
     """
-    return isinstance(space, spaces.Box) and space.dtype.kind == "f" and len(space.shape) == 3 and space.is_bounded()
+    return is_bounded_image_space(space) and np.dtype(space.dtype).kind == "f"
+
+
+def is_bounded_image_space(space: gym.Space[Any]) -> bool:
+    """Whether observations are images of any numbers between declared bounds.
+
+    :param space: of observations
+    """
+    return isinstance(space, spaces.Box) and len(space.shape) == 3 and 0 not in space.shape and space.is_bounded()
 
 
 def space_to_json(space: gym.Space[Any]) -> dict[str, Any]:
@@ -143,19 +151,6 @@ def fit_actions(actions: Any, space: gym.Space[Any], where: str) -> NDArray[Any]
     if not kinds or array.shape[1:] != row_shape or not ((array >= low) & (array <= high)).all():
         raise ValueError(f"{where} has actions ({array.dtype}, {array.shape}) that are not in the action space {space}")
     return array if dtype.kind == "f" else array.astype(dtype)
-
-
-def require_actions_from_0(space: gym.Space[Any]) -> None:
-    """Refuse numbers of actions that begin elsewhere: environments would get others than Stable-Baselines3 means.
-
-    :param space: of one action
-    :raises ValueError: naming the remedy
-    """
-    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and np.any(space.start != 0):
-        raise ValueError(
-            f"Stable-Baselines3 counts actions from 0, and these do not: {space}; register a variant of the "
-            "environment in gymnasium.wrappers.TransformAction"
-        )
 
 
 def executed_actions(space: gym.Space[Any], stored: NDArray[Any], scaled: bool, clipped: bool) -> NDArray[Any]:

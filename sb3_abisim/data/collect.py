@@ -256,6 +256,11 @@ def _command(args: argparse.Namespace) -> None:
     policy = None
     if args.policy_fn is not None and args.policy != "random":
         policy = args.policy_fn(args.policy, args.epsilon, args.trust)
+    elif args.policy_fn is not None and args.epsilon:
+        raise ValueError(
+            f"--epsilon {args.epsilon:g} puts random actions in place of a policy's, and all actions are random here; "
+            "leave it out, or give --policy RUN"
+        )
     try:
         collect(
             args.env,

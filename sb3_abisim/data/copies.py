@@ -23,7 +23,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from sb3_abisim.common.images import fits
-from sb3_abisim.common.spaces import is_channels_first, is_float_image_space
+from sb3_abisim.common.spaces import is_bounded_image_space, is_channels_first, is_float_image_space
 
 MakeFn = Callable[[], gym.Env[Any, Any]]
 _WRAPPERS = (
@@ -33,6 +33,12 @@ _WRAPPERS = (
 _FLOATS = (
     'two wrappers of gymnasium 1.4 make bytes of these floats: --env-wrapper "gymnasium.wrappers.RescaleObservation: '
     '{min_obs: 0, max_obs: 255}" "gymnasium.wrappers.DtypeObservation: {dtype: uint8}"'
+)
+# Of integers, differences and scaled numbers may not fit.
+_INTEGERS = (
+    'three wrappers of gymnasium 1.4 make them: --env-wrapper "gymnasium.wrappers.DtypeObservation: {dtype: float32}" '
+    '"gymnasium.wrappers.RescaleObservation: {min_obs: 0, max_obs: 255}" '
+    '"gymnasium.wrappers.DtypeObservation: {dtype: uint8}"'
 )
 # Where the channels of an observation are: (C, H, W), (H, W, C) or (H, W).
 FIRST, LAST, NONE = "first", "last", "none"
@@ -80,7 +86,9 @@ class ImageLayout:
                 )
             image_key = images[0] if image_key is None else image_key
             if image_key not in images:
-                raise ValueError(f"image_key {image_key!r} is not one of the images {images} in {space}")
+                raise ValueError(
+                    f"image_key {image_key!r} is not one of the images {images} in {space}; give one of them"
+                )
             for key, part in space.spaces.items():
                 if key != image_key and isinstance(part, spaces.Box | spaces.Discrete | spaces.MultiBinary):
                     name = factor_name(key)
@@ -94,8 +102,8 @@ class ImageLayout:
         elif image_key is not None:
             raise ValueError(f"image_key {image_key!r} chooses from a Dict of observations, got {space}; leave it out")
         if not _is_image(space):
-            if remedy == _WRAPPERS and is_float_image_space(space):
-                remedy = _FLOATS
+            if remedy == _WRAPPERS and is_bounded_image_space(space):
+                remedy = _FLOATS if is_float_image_space(space) else _INTEGERS
             raise ValueError(
                 "observations must be uint8 images in 0..255 of shape (channels, height, width), (height, width, "
                 f"channels) or (height, width), got {space}; {remedy}"
@@ -221,7 +229,12 @@ def factor_name(key: str) -> str:
 
 
 def _is_image(space: gym.Space[Any]) -> bool:
-    if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or len(space.shape) not in (2, 3):
+    if (
+        not isinstance(space, spaces.Box)
+        or space.dtype != np.uint8
+        or len(space.shape) not in (2, 3)
+        or 0 in space.shape
+    ):
         return False
     return bool(space.low.min() == 0 and space.high.max() == 255)
 

@@ -98,6 +98,7 @@ _HINTS = (
     (r"requires render_mode", "add --env-kwargs render_mode:rgb_array"),
     # Wrappers of Gymnasium 1.2 that render assert without a word.
     (r"^AssertionError AssertionError$", "where a wrapper renders, add --env-kwargs render_mode:rgb_array"),
+    (r"unexpected keyword argument", "correct --env-kwargs, or env_kwargs of the zoo's entry"),
     (r"(?i)opengl|glfw|egl|osmesa", "rendering without a display needs MUJOCO_GL=egl in front of the command"),
     (r"to be a tuple, got .*list", "a YAML has lists only; rl_zoo3.wrappers.YAMLCompatResizeObservation takes one"),
 )

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
@@ -25,15 +26,29 @@ class Policy:
         the same observations must give the same actions
     :param name: recorded with the dataset; it should say which weights there are
     :param epsilon: probability of a uniformly random action in its place
+    :param action_space: of its actions; None where that is not known
     """
 
     act_fn: Callable[[NDArray[np.uint8]], NDArray[Any]]
     name: str
     epsilon: float = 0.0
+    action_space: gym.Space[Any] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.epsilon <= 1:
             raise ValueError(f"epsilon must be in 0..1, got {self.epsilon}")
+
+    def require_actions(self, space: gym.Space[Any]) -> None:
+        """Refuse an environment whose actions the policy does not choose.
+
+        :param space: of one environment's actions
+        :raises ValueError: with both sides
+        """
+        if self.action_space is not None and self.action_space != space:
+            raise ValueError(
+                f"{self.name} chooses from {self.action_space}, and the environment takes {space}; give the policy's "
+                "environment, with its --env-kwargs and --env-wrapper"
+            )
 
 
 def collect_shard(
@@ -96,6 +111,12 @@ class Rollout:
         if self._policy is not None and by_policy.any():
             n_envs, _, _, *size = self._stack.shape
             chosen = np.asarray(self._policy.act_fn(self._stack.reshape(n_envs, -1, *size)))
+            self._policy.require_actions(self._env.single_action_space)
+            if chosen.size != actions.size:
+                raise ValueError(
+                    f"{self._policy.name} chose actions of shape {chosen.shape} for {n_envs} environments that take "
+                    f"{self._env.single_action_space}; let it choose one for each of them"
+                )
             actions[by_policy] = chosen.reshape(actions.shape)[by_policy]
 
     def _push(self, done: NDArray[np.bool_]) -> None:

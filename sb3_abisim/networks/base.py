@@ -3,6 +3,7 @@
 An encoder takes what Stable-Baselines3 hands to a features extractor: float images in 0..1, channels first.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -175,13 +176,21 @@ def make_encoder(observation_space: gym.Space[Any], name: str | None = None, **k
     try:
         module = factory(observation_space, **own_kwargs)
     except TypeError as error:
-        raise ValueError(f"{name} does not take these arguments: {error}") from error
+        parameters = list(inspect.signature(factory).parameters.values())[1:]
+        names = ", ".join(one.name for one in parameters if one.kind is not one.VAR_KEYWORD)
+        takes = f"; it takes {names}" if names else ""
+        raise ValueError(
+            f"{name} does not take these arguments ({error}){takes}; correct network_kwargs, or leave them out"
+        ) from error
     if not isinstance(module, Encoder):
         module = Encoder(module, find_features_dim(name, module, shape), name, own_kwargs, shape)
     # SB3 turns observations into float32, whatever torch's default is.
     encoder: Encoder = module.float()
     if shape != encoder.input_shape:
-        raise ValueError(f"{name} takes observations of shape {encoder.input_shape}, got {shape}")
+        raise ValueError(
+            f"{name} takes observations of shape {encoder.input_shape}, got {shape}; name another network, such as "
+            f"{generic_network(shape)}"
+        )
     if top:
         encoder.put_on_top(**top)
     return encoder
@@ -225,9 +234,10 @@ def require_size(name: str, observation_space: gym.Space[Any], size: int) -> tup
     """
     n_channels, height, width = observation_space.shape or ()
     if min(height, width) < size:
+        other = "" if name == "small" else "name another network, such as small, or "
         raise ValueError(
             f"{name} takes images of at least {size} x {size} pixels, got {height} x {width}; "
-            "name another network, such as small, or enlarge the images by a wrapper"
+            f"{other}enlarge the images by a wrapper"
         )
     return n_channels, height, width
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 
 from sb3_abisim.common.arguments import checked_arguments
 from sb3_abisim.common.method_settings import settings_entry
-from sb3_abisim.common.spaces import require_actions_from_0
+from sb3_abisim.envs.plain_actions import require_plain
 from sb3_abisim.registry import get_method, get_objective
 from sb3_abisim.rl.auxiliary_data import ReplaySteps, RolloutHistory, RolloutSteps, Steps, read_rollout
 from sb3_abisim.rl.auxiliary_trainer import N_PREPARE, AuxiliarySettings, AuxiliaryTrainer
@@ -106,7 +106,7 @@ class AuxiliaryObjective(BaseCallback):
         # A list tells its callbacks their parent after their init.
         require_every_event(self)
         require_weights(self.model)
-        require_actions_from_0(self.model.action_space)
+        require_plain(self.model.action_space)
         self._refuse_another(self.locals.get("callback"))
         extractors = trained_extractors(self.model, self.training_env, self.weight)
         seed = self.model.seed if self.seed is None else self.seed

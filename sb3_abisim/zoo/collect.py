@@ -65,6 +65,8 @@ def model_policy(name: str, epsilon: float, trust: bool = False) -> Policy:
     :raises ValueError: if it is none, or was trained on something else than observations
     """
     path = Path(name)
+    if not path.exists():
+        raise ValueError(f"--policy: there is no {path}; give a run's folder, or a .zip in it")
     run = read_run(path if path.is_dir() else path.parent)
     means = saved_means(run)
     if means is not None and run.settings.get("frame_stack"):
@@ -96,4 +98,4 @@ def model_policy(name: str, epsilon: float, trust: bool = False) -> Policy:
         actions: NDArray[Any] = model.predict(seen, deterministic=True)[0]
         return actions
 
-    return Policy(act, f"{run.algo} {file_hash(path)[:16]}", epsilon)
+    return Policy(act, f"{run.algo} {file_hash(path)[:16]}", epsilon, model.action_space)

@@ -33,6 +33,8 @@ _UNPICKLES = "plot_from_file"
 _TRUST = "--trust"
 # Before training has begun, they are mistakes of the command.
 _MISTAKES = (ValueError, OSError, ImportError, AssertionError, TypeError, gym.error.Error)
+# What Stable-Baselines3 says of actions that an algorithm does not choose, and what helps.
+_OTHER_ACTIONS, _OTHER_ALGORITHM = " as action spaces but ", "; give an --algo for such actions, ppo or a2c for any"
 _PACKAGES = ("--packages", "--gym-packages")
 _CONF_FILE = ("-conf", "--conf-file")
 _AUXILIARY, _IMAGE_KEY = "--auxiliary", "--image-key"
@@ -113,7 +115,9 @@ def main(argv: Sequence[str]) -> None:
             raise
         # As of every other command.
         code = 1 if is_of_system(error) else 2
-        print(f"{prog}: {'error: ' if code == 2 else ''}{with_remedy(error)}", file=sys.stderr)
+        text = with_remedy(error)
+        text += _OTHER_ALGORITHM if _OTHER_ACTIONS in text else ""
+        print(f"{prog}: {'error: ' if code == 2 else ''}{text}", file=sys.stderr)
         sys.exit(code)
     finally:
         MethodExperimentManager.builds_from_yaml = False

@@ -15,6 +15,7 @@ import gymnasium as gym
 from stable_baselines3.common.vec_env import VecMonitor, VecTransposeImage
 
 from sb3_abisim.data.environments import VEC_ENV_KEY, Preprocessing
+from sb3_abisim.envs.plain_actions import PLAIN_ACTIONS
 from sb3_abisim.networks.encoder_file import EncoderFile
 from sb3_abisim.rl.vec_encode import VecEncodeObservations
 from sb3_abisim.zoo.named import named_class
@@ -59,8 +60,14 @@ def check_preprocessing(file: EncoderFile, settings: Mapping[str, Any], frozen: 
     recorded = file.metadata["preprocessing"]
     _refuse_vec_env(recorded, str(file.path))
     there: dict[str, Any] = {"env_wrapper": items(recorded.get("env_wrapper")), "frame_stack": frame_stack_of(file)}
-    here: dict[str, Any] = {name: settings.get(name) for name in there}
-    here = {"env_wrapper": items(here["env_wrapper"]), "frame_stack": here["frame_stack"] or 1}
+    here: dict[str, Any] = {
+        "env_wrapper": items(settings.get("env_wrapper")),
+        "frame_stack": settings.get("frame_stack") or 1,
+    }
+    # It changes no observation.
+    plain = [item for item in here["env_wrapper"] if item == PLAIN_ACTIONS]
+    for side in (there, here):
+        side["env_wrapper"] = [item for item in side["env_wrapper"] if item != PLAIN_ACTIONS]
     different = [name for name in there if there[name] != here[name]] if recorded else []
     if frozen:
         # The wrapper stacks by itself, whether hyperparameters say so or not.
@@ -70,7 +77,9 @@ def check_preprocessing(file: EncoderFile, settings: Mapping[str, Any], frozen: 
     if not different:
         return
     sides = "; ".join(f"{name}: {there[name]} in pretraining, {here[name]} now" for name in different)
-    wanted = {name: there[name] or None for name in different}
+    wanted: dict[str, Any] = {name: there[name] or None for name in different}
+    if plain and "env_wrapper" in wanted:
+        wanted["env_wrapper"] = [*there["env_wrapper"], *plain]
     if frozen and "frame_stack" in wanted:
         sides += ", which would stack embeddings"
         wanted["frame_stack"] = None

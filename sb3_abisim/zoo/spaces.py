@@ -7,7 +7,8 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space
 
-from sb3_abisim.common.spaces import is_channels_first, require_actions_from_0
+from sb3_abisim.common.spaces import is_channels_first
+from sb3_abisim.envs.plain_actions import require_plain
 
 _NUMBERS = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
 
@@ -20,7 +21,7 @@ def check_spaces(env: gym.Env[Any, Any], frame_stack: int | None) -> None:
     :raises ValueError: naming what is wrong, and the remedy
     """
     space = env.observation_space
-    require_actions_from_0(env.action_space)
+    require_plain(env.action_space)
     parts = space.spaces if isinstance(space, spaces.Dict) else {}
     for stacked, taken in ((False, _NUMBERS), (True, spaces.Box)):
         others = {key: part for key, part in parts.items() if not isinstance(part, taken)}

@@ -112,6 +112,9 @@ def test_sweep_pretrains_what_is_missing_once(tmp_path):
     [
         (["perturbation", "PointMaze-v0/ssi"], "observation"),
         (["perturbation", "-n", "0"], "at least 1, got 0"),
+        # Not what its observations are.
+        (["perturbation", "PointMaze-v0/ssi", "--env", "PointMaze-v0"], "in Nav2D alone, got 'PointMaze-v0'"),
+        (["pixels", "Nav2D-v0/ssi", "--env", "CartPole-v1"], "in the point mazes alone, got 'CartPole-v1'"),
         (["near-far", "--env", "PointMaze-v0"], "in Nav2D alone, got 'PointMaze-v0'"),
         (["pixels", "--env", "Nav2D-v0"], "in the point mazes alone, got 'Nav2D-v0'"),
         (["probes", "--env", "Nav3D-v0", "Nav2D-v0/ssi"], "unknown environment 'Nav3D-v0'"),

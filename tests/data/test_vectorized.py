@@ -261,7 +261,7 @@ def test_atari(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ale_py = pytest.importorskip("ale_py", reason="needs the extra [atari]")
     gym.register_envs(ale_py)
     main(["--env", "ALE/Pong-v5", "-n", "30", "--n-envs", "2", "-o", str(tmp_path / "single")])
-    assert "not as its vector environment: its observation space is" in capsys.readouterr().err
+    assert "without its faster vector environment: its observation space is" in capsys.readouterr().err
     assert TransitionDataset(tmp_path / "single").observation_space.shape == (3, 210, 160)
 
     def make() -> gym.vector.VectorEnv:

@@ -95,8 +95,9 @@ def test_inputs_are_mapped_to_plus_minus_one():
     [
         ((20, 20, 3), None, {}, r"\(20, 20, 3\) have their channels last.*VecTransposeImage"),
         ((3, 64, 64), "ResNet", {}, "ResNet"),
-        ((3, 64, 64), "PointMazeEncoder", {"width": 3}, "width"),
-        ((3, 15, 15), "PointMazeEncoder", {}, "shape"),
+        ((3, 64, 64), "PointMazeEncoder", {"width": 3}, r"'width'\); correct network_kwargs"),
+        ((3, 64, 64), "nature", {"width": 3}, r"'width'\); it takes features_dim; correct network_kwargs"),
+        ((3, 15, 15), "PointMazeEncoder", {}, "shape .*, got .*; name another network, such as small"),
         ((4, 64, 64), "PointMazeEncoder", {}, "shape"),
         ((8,), "PointMazeEncoder", {}, "observations must be images"),
     ],
@@ -221,7 +222,7 @@ def test_a_registered_network_may_be_the_default_of_a_shape(registered):
     registered("pooled", pooled, observation_shape=(1, 9, 9))
     assert make_encoder(image_space(1, 9, 9)).spec() == {"name": "pooled", "kwargs": {}}
     assert make_encoder(image_space(1, 9, 8)).spec()["name"] == "small"
-    with pytest.raises(ValueError, match=r"pooled does not take these arguments: .*depth"):
+    with pytest.raises(ValueError, match=r"pooled does not take these arguments .*depth.*; it takes "):
         make_encoder(image_space(1, 9, 9), depth=3)
 
 

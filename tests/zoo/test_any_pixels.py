@@ -1,5 +1,6 @@
 """The three commands on environments of odd shapes, from the command line to an agent that is evaluated."""
 
+import gc
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,13 @@ class OddEnv(gym.Env[Any, Any]):
 
     def __init__(
         self, shape: tuple[int, ...] = (40, 56, 3), actions: str = "discrete", vector: bool = False, text: bool = False,
-        floats: bool = False, render_mode: str | None = None,
+        floats: bool = False, dtype: str = "uint8", render_mode: str | None = None,
     ) -> None:  # fmt: skip
-        image = spaces.Box(0, 1, tuple(shape), np.float32) if floats else spaces.Box(0, 255, tuple(shape), np.uint8)
+        image = (
+            spaces.Box(0, 1, tuple(shape), np.float32)
+            if floats
+            else spaces.Box(0, 255, tuple(shape), np.dtype(dtype).type)
+        )
         parts: dict[str, Any] = {"eye": image, "arm": spaces.Box(-1, 1, (3,)), "door": spaces.Discrete(2)}
         parts |= {"words": spaces.Text(4)} if text else {}
         self.observation_space = spaces.Dict(parts) if vector or text else image
@@ -79,6 +84,16 @@ CASES: dict[str, tuple[list[str], list[str], str]] = {
         ["shape:[12, 16, 3]", "floats:true"],
         [
             "env_wrapper:[{gymnasium.wrappers.RescaleObservation: {min_obs: 0, max_obs: 255}}, "
+            "{gymnasium.wrappers.DtypeObservation: {dtype: uint8}}]"
+        ],
+        "ppo",
+    ),
+    "actions counted from 2": (["shape:[12, 16, 3]", "actions:start"], ["env_wrapper:sb3_abisim.PlainActions"], "dqn"),
+    "integers": (
+        ["shape:[12, 16, 3]", "dtype:int64"],
+        [
+            "env_wrapper:[{gymnasium.wrappers.DtypeObservation: {dtype: float32}}, "
+            "{gymnasium.wrappers.RescaleObservation: {min_obs: 0, max_obs: 255}}, "
             "{gymnasium.wrappers.DtypeObservation: {dtype: uint8}}]"
         ],
         "ppo",
@@ -165,8 +180,11 @@ def test_an_entry_of_the_zoo_whose_policy_kwargs_are_a_text(
         (["shape:[3, 12, 12]", "text:true"], [], 2, "words (Text) have no numbers; keep the others only"),
         (["shape:[16, 12, 3]", "vector:true"], ["frame_stack:2"], 2, "door (Discrete) cannot be stacked; keep"),
         (["shape:[40, 48]"], [], 2, "ReshapeObservation: {shape: [40, 48, 1]}"),
-        (["actions:start"], [], 2, "counts actions from 0, and these do not: Discrete(3, start=2)"),
+        (["actions:start"], [], 2, "Discrete(3, start=2); wrap the environment in sb3_abisim.PlainActions"),
         (["shape:[12, 16, 3]", "floats:true"], [], 0, 'RescaleObservation: {min_obs: 0, max_obs: 255}" "gymnasium'),
+        (["shape:[12, 16, 3]", "dtype:int64"], [], 0, 'DtypeObservation: {dtype: float32}" "gymnasium.wrappers.Resc'),
+        (["shape:[0, 7, 3]"], [], 0, "(0, 7, 3), uint8); a wrapper makes images"),
+        (["hape:[2, 3]"], [], 0, "; correct --env-kwargs, or env_kwargs of the zoo's entry"),
         (["shape:[2, 3, 4, 5]"], [], 0, "observations must be uint8 images"),
     ],
 )  # fmt: skip
@@ -181,6 +199,38 @@ def test_refusals_name_the_remedy(
     assert stopped.value.code == 2
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
     assert message in line
+
+
+def test_a_wrapper_of_actions_may_be_added_in_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It changes no observation. Another wrapper does, and the remedy keeps the one of actions."""
+    *before, train = commands(tmp_path, ["shape:[12, 16, 3]", "actions:start"], [], "ppo")
+    for words in before:
+        run(monkeypatch, *words)
+    run(monkeypatch, *train, "env_wrapper:sb3_abisim.PlainActions")
+    folder = tmp_path / "logs" / "ppo" / "Odd-v0_1"
+    assert np.load(evaluate_final(folder, 2))["deterministic/standard/ep_lengths"].tolist() == [LENGTH] * 2
+    other = "{gymnasium.wrappers.ReshapeObservation: {shape: [12, 16, 3]}}"
+    with pytest.raises(SystemExit):
+        run(monkeypatch, *train, f"env_wrapper:[{other}, sb3_abisim.PlainActions]", "frame_stack:2")
+    error = capsys.readouterr().err
+    assert "add -params 'env_wrapper:['\"'\"'sb3_abisim.PlainActions'\"'\"']' frame_stack:1, or" in error
+
+
+# rl-zoo3 leaves monitor files open.
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_algorithm_for_other_actions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    *before, train = commands(tmp_path, ["shape:[12, 16, 3]", "actions:multi_binary"], [], "dqn")
+    for words in before:
+        run(monkeypatch, *words)
+    with pytest.raises(SystemExit):
+        run(monkeypatch, *train)
+    error = capsys.readouterr().err
+    assert "but MultiBinary(2) was provided; give an --algo for such actions, ppo or a2c for any" in error
+    gc.collect()  # here rather than in a later test
 
 
 def test_rewards_are_not_normalized_behind_a_replay_buffer(
