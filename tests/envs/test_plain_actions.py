@@ -47,7 +47,7 @@ def test_the_environment_gets_its_own_actions(kind: str) -> None:
     assert env.action_space == space and env.action_space.dtype == SPACES[kind].dtype
     require_plain(space)
     if space != SPACES[kind]:
-        with pytest.raises(ValueError, match=f"do not: .*wrap the environment in {PLAIN_ACTIONS}"):
+        with pytest.raises(ValueError, match=f"(?s)do not: .*wrap the environment in {PLAIN_ACTIONS}"):
             require_plain(SPACES[kind])
     env.step(given if kind == "discrete" else np.array(given, space.dtype))
     assert np.array_equal(env.unwrapped.taken, np.array(taken, SPACES[kind].dtype))
