@@ -54,12 +54,14 @@ def record(
     :param seed: of the episodes and of the actions
     :param trust: see :func:`~sb3_abisim.zoo.models.load_model`
     :return: how the episodes went
-    :raises ValueError: if the folder holds no finished run, or ``n_episodes`` is below 1
+    :raises ValueError: if the folder holds no finished run, ``n_episodes`` is below 1, or the file is named otherwise
     """
     from stable_baselines3.common.utils import set_random_seed
 
     if n_episodes < 1:
         raise ValueError(f"n_episodes must be at least 1, got {n_episodes}")
+    if Path(path).suffix.lower() != ".gif":
+        raise ValueError(f"what is written is a GIF, and {Path(path).name} would say otherwise; call it NAME.gif")
     check_output(path)
     zoo_run = read_run(run_folder)
     model = final_model(zoo_run, trust)

@@ -100,13 +100,14 @@ def test_the_seed_is_that_of_the_actions_too(run_folder, tmp_path, monkeypatch):
     [
         (["nowhere"], "nowhere is no run folder of rl-zoo3"),
         (["RUN", "--episodes", "0"], "n_episodes must be at least 1, got 0"),
+        (["RUN", "-o", "agent.mp4"], "what is written is a GIF, and agent.mp4 would say otherwise; call it NAME.gif"),
         (["RUN", "--packages", "no_such_module"], "--packages: cannot import 'no_such_module'"),
     ],
 )
 def test_errors_name_the_value(run_folder, tmp_path, capsys, arguments, message):
     words = [str(run_folder) if word == "RUN" else word for word in arguments]
     with pytest.raises(SystemExit):
-        main([*words, "-o", str(tmp_path / "a.gif")])
+        main(["-o", str(tmp_path / "a.gif"), *words])
     assert message in capsys.readouterr().err
     assert not (tmp_path / "a.gif").exists()
 
