@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from sb3_abisim.envs.base import BatchEnv, SingleEnv
     from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
     from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
+    from sb3_abisim.envs.shortest_paths import ShortestPaths
     from sb3_abisim.networks.base import Encoder
     from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
     from sb3_abisim.networks.from_module import from_module
@@ -57,6 +58,7 @@ _PUBLIC = {
     "Objective": "objectives.base",
     "PointMazePixels": "envs.point_maze.pixel_wrapper",
     "Segment": "data.writer",
+    "ShortestPaths": "envs.shortest_paths",
     "SingleEnv": "envs.base",
     "TensorBatch": "objectives.base",
     "TransitionDataset": "data.dataset",
@@ -89,6 +91,7 @@ __all__ = [
     "Objective",
     "PointMazePixels",
     "Segment",
+    "ShortestPaths",
     "SingleEnv",
     "TensorBatch",
     "TransitionDataset",

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_abisim.analysis.nav2d_exact import EVAL_SEED, embed
-from sb3_abisim.analysis.probes import Target, read
+from sb3_abisim.analysis.probes import Target, train_probe
 from sb3_abisim.analysis.scenes import N_COPIES, eval_settings, offsets_within, preprocessing_of
 from sb3_abisim.common.extras import require_extra
 from sb3_abisim.data.environments import Preprocessing, make_vector_env
@@ -110,11 +110,12 @@ def readouts(encoder: Encoder, learn: States, tests: dict[str, States]) -> Score
     """
     shown, learned = learn
     features = embed(encoder, shown).numpy()
+    probes = {name: train_probe("linear", features, target) for name, target in learned.items()}
     scores: Scores = {}
     for setting, (test, tested) in tests.items():
         test_features = embed(encoder, test).numpy()
-        read_off = {name: read("linear", features, learned[name], test_features, tested[name]) for name in learned}
-        scores[setting] = {name: score for name, score in read_off.items() if score is not None}
+        found = {name: tested[name].score(predict(test_features)) for name, predict in probes.items()}
+        scores[setting] = {name: score for name, score in found.items() if score is not None}
     return scores
 
 
