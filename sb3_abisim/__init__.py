@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sb3_abisim.envs.plain_actions import PlainActions
     from sb3_abisim.envs.point_maze.pixel_wrapper import PointMazePixels
     from sb3_abisim.envs.sb3_vec_env import BatchedVecEnv
+    from sb3_abisim.envs.shortest_paths import ShortestPaths
     from sb3_abisim.networks.base import Encoder
     from sb3_abisim.networks.encoder_file import load_encoder, save_encoder
     from sb3_abisim.networks.from_module import from_module
@@ -59,6 +60,7 @@ _PUBLIC = {
     "PlainActions": "envs.plain_actions",
     "PointMazePixels": "envs.point_maze.pixel_wrapper",
     "Segment": "data.writer",
+    "ShortestPaths": "envs.shortest_paths",
     "SingleEnv": "envs.base",
     "TensorBatch": "objectives.base",
     "TransitionDataset": "data.dataset",
@@ -92,6 +94,7 @@ __all__ = [
     "PlainActions",
     "PointMazePixels",
     "Segment",
+    "ShortestPaths",
     "SingleEnv",
     "TensorBatch",
     "TransitionDataset",

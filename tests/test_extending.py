@@ -81,6 +81,9 @@ def _single_commands(folder: Path, tmp_path: Path, flags: list[str]) -> None:
     run(folder, tmp_path, "analyze", "probes", *flags, "dot.safetensors", "-n", "20", "--images", "figures")
     probes = json.loads((tmp_path / "figures" / "probes-my-Dot-v0.json").read_bytes())
     assert "dot.safetensors" in probes["encoders"]
+    run(folder, tmp_path, "analyze", "readouts", *flags, "dot.safetensors", "-n", "60", "-o", "readouts.json")
+    (scores,) = json.loads((tmp_path / "readouts.json").read_bytes())["encoders"]["dot.safetensors"]["scores"].values()
+    assert list(scores) == ["optimal_action", "blocked_1", "blocked_2", "blocked_3", "blocked_4"]
 
 
 @pytest.mark.parametrize("by", ["packages", "entry point"])

@@ -59,6 +59,7 @@ CALLS: dict[str, list[tuple[str, str]]] = {
     "rliable": [("benchmark", "main(['benchmark', 'report', 'run'])")],
     "scipy": [
         ("scan", "gym.make('ScanNav-v0')"),
+        ("analysis", "main(['analyze', 'readouts', 'PointMaze-v0/ssi', '--env', 'PointMaze-v0', '-n', '2'])"),
         ("benchmark", "main(['benchmark', 'report', 'run'])"),
         ("benchmark", "main(['push', 'Nav2D-v0/ssi', 'owner/name', '--benchmark', 'run', '-o', 'new'])"),
     ],

@@ -184,24 +184,25 @@ def _exact(args: argparse.Namespace) -> None:
 def _readouts_parser(name: str) -> argparse.ArgumentParser:
     parser = make_parser(
         "analyze readouts",
-        "What an agent needs to find the goal of Nav2D, read from frozen embeddings by ridge regression.",
+        "What an agent needs to find the goal, read from frozen embeddings by ridge regression. For environments that "
+        "offer shortest paths: Nav2D, the point mazes, ScanNav, and yours if its batch class has shortest_paths().",
         "analyze readouts Nav2D-v0/ssi Nav2D-v0/abisim -o readouts.json",
     )
     parser.add_argument("encoders", nargs="+", metavar="ENCODER", help="encoder files or names")
-    parser.add_argument("--env", default="Nav2D-v0", metavar="ID", help="an id of Nav2D (default: %(default)s)")
+    parser.add_argument("--env", default="Nav2D-v0", metavar="ID", help="environment (default: %(default)s)")
     parser.add_argument(
-        "--n-layouts", type=int, default=readouts.N_LAYOUTS,
-        help="to learn from, and as many others to score (default: %(default)s)",
+        "-n", type=int, default=readouts.N_STATES,
+        help="states to learn from, and as many others to score (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=EVAL_SEED, help="of the first layout (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=EVAL_SEED, help="of the first episode (default: %(default)s)")
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the numbers there as JSON")
     return parser
 
 
 def _readouts(args: argparse.Namespace) -> None:
-    check_nav2d(args.env)
+    readouts.check_offers(args.env)
     _make_room(args.output)
-    results = readouts.compare(load_all(args.encoders, args.env), args.env, args.n_layouts, args.seed)
+    results = readouts.compare(load_all(args.encoders, args.env, as_pretrained=True), args.env, args.n, args.seed)
     print(readouts.table(results))
     _write(results, args.output)
 
@@ -265,7 +266,7 @@ _Run = Callable[[argparse.Namespace], None]
 # Name: what it does, its parser and its function.
 COMMANDS: dict[str, tuple[str, Callable[[str], argparse.ArgumentParser], _Run]] = {
     "exact": ("compare encoders of Nav2D with the action-bisimulation metric, solved exactly", _exact_parser, _exact),
-    "readouts": ("what an agent needs on Nav2D, read from embeddings", _readouts_parser, _readouts),
+    "readouts": ("what an agent needs to find the goal, read from embeddings", _readouts_parser, _readouts),
     **{name: (one.help, _figure_parser, _figure) for name, one in FIGURES.items()},
     "sweep": ("perturbation maps on Nav2D over c, beside those of the exact metric", _sweep_parser, _sweep),
     "all": ("every figure, with the default encoders", _all_parser, _all),

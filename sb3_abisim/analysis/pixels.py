@@ -16,8 +16,8 @@ from sb3_abisim.analysis.scenes import Samples, eval_settings, render_point_maze
 from sb3_abisim.envs.backgrounds.clips import Backgrounds
 from sb3_abisim.envs.base import batch_class
 from sb3_abisim.envs.point_maze.distractors import DistractorPointMazeVectorEnv
-from sb3_abisim.envs.point_maze.env import ROOM_SIZE, PointMazeVectorEnv
-from sb3_abisim.envs.point_maze.layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METER
+from sb3_abisim.envs.point_maze.env import PointMazeVectorEnv
+from sb3_abisim.envs.point_maze.layout import GOAL_RADIUS, OBSTACLE_PIXELS, PIXELS_PER_METER, ROOM_SIZE
 from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS
 from sb3_abisim.networks.base import Encoder
 from sb3_abisim.networks.encoder_file import EncoderFile

@@ -11,6 +11,7 @@ all of its ``factors()``.
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -124,6 +125,31 @@ def make_probe(kind: str) -> Any:
     )
 
 
+def train_probe(kind: str, features: NDArray[Any], target: Target) -> Callable[[NDArray[Any]], NDArray[np.float64]]:
+    """Train a probe.
+
+    :param kind: one of :data:`PROBES`
+    :param features: (n, features_dim)
+    :param target: to learn
+    :return: from other features, (m, features_dim), to its predictions, (m, n_outputs)
+    """
+    mean, std = target.values.mean(axis=0), target.values.std(axis=0)
+    # Classes and yes-or-no answers are learned by least squares as well; their scores are of ranks.
+    scale = np.where(std > 0, std, 1.0) if target.kind == "continuous" else np.ones_like(std)
+    probe = make_probe(kind)
+    wanted = (target.values - mean) / scale
+    with warnings.catch_warnings():
+        # A network that stops at the limit of its epochs is a result, too.
+        warnings.simplefilter("ignore")
+        probe.fit(features, wanted[:, 0] if wanted.shape[1] == 1 else wanted)
+
+    def predict(features: NDArray[Any]) -> NDArray[np.float64]:
+        predictions: NDArray[np.float64] = np.asarray(probe.predict(features)).reshape(len(features), -1) * scale + mean
+        return predictions
+
+    return predict
+
+
 def read(
     kind: str, features: NDArray[Any], target: Target, test_features: NDArray[Any], test_target: Target
 ) -> float | None:
@@ -136,17 +162,7 @@ def read(
     :param test_target: to score
     :return: see :meth:`Target.score`
     """
-    mean, std = target.values.mean(axis=0), target.values.std(axis=0)
-    # Classes and yes-or-no answers are learned by least squares as well; their scores are of ranks.
-    scale = np.where(std > 0, std, 1.0) if target.kind == "continuous" else np.ones_like(std)
-    probe = make_probe(kind)
-    wanted = (target.values - mean) / scale
-    with warnings.catch_warnings():
-        # A network that stops at the limit of its epochs is a result, too.
-        warnings.simplefilter("ignore")
-        probe.fit(features, wanted[:, 0] if wanted.shape[1] == 1 else wanted)
-    predictions = np.asarray(probe.predict(test_features)).reshape(len(test_features), -1)
-    return test_target.score(predictions * scale + mean)
+    return test_target.score(train_probe(kind, features, target)(test_features))
 
 
 def probes(files: dict[str, EncoderFile], env_id: str, n_episodes: int, seed: int = 0) -> dict[str, Any]:

@@ -13,11 +13,11 @@ from sb3_abisim.data.environments import Preprocessing, make_vector_env
 from sb3_abisim.data.format import check_spaces
 from sb3_abisim.data.rollout import collect_shard
 from sb3_abisim.envs.backgrounds.player import composite
-from sb3_abisim.envs.base import BatchEnv, batch_class
-from sb3_abisim.envs.nav2d import SIZE, Nav2DVectorEnv
+from sb3_abisim.envs.base import BatchEnv, batch_class, offers
+from sb3_abisim.envs.nav2d import Nav2DVectorEnv
 from sb3_abisim.envs.point_maze import top_down
 from sb3_abisim.envs.point_maze.distractors import DistractorPointMazeVectorEnv
-from sb3_abisim.envs.point_maze.env import ROOM_SIZE, PointMazeVectorEnv
+from sb3_abisim.envs.point_maze.env import PointMazeVectorEnv
 from sb3_abisim.envs.point_maze.layout import (
     GOAL_MASK,
     OBSTACLE_PIXELS,
@@ -27,7 +27,6 @@ from sb3_abisim.envs.point_maze.layout import (
     to_pixels,
 )
 from sb3_abisim.envs.scan_nav.env import ScanNavVectorEnv
-from sb3_abisim.envs.scan_nav.map import ScanMap
 from sb3_abisim.networks.encoder_file import EncoderFile
 from sb3_abisim.registry import get_traits
 from sb3_abisim.zoo.preprocessing import recorded_preprocessing
@@ -39,7 +38,6 @@ MAX_STEPS = 1000
 MAX_BYTES = 2**30
 # Points around the agent, this many cells, meters or steps in each direction.
 LOCAL_REACH = 2
-_HALF_OBSTACLE = OBSTACLE_PIXELS / PIXELS_PER_METER / 2
 
 
 @dataclass(frozen=True)
@@ -195,6 +193,17 @@ def agent_positions(samples: Samples) -> NDArray[np.float64] | None:
     return None
 
 
+def offsets_within(reach: int) -> NDArray[np.int64]:
+    """(x, y) of the points around the agent, row by row, (n_points, 2).
+
+    :param reach: points in each direction
+    """
+    steps = np.arange(-reach, reach + 1)
+    square = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    offsets: NDArray[np.int64] = square[(square != 0).any(axis=1)]
+    return offsets
+
+
 def local_obstacles(samples: Samples) -> NDArray[np.bool_] | None:
     """Whether the points around the agent are blocked, by an obstacle or because they lie outside.
 
@@ -204,39 +213,9 @@ def local_obstacles(samples: Samples) -> NDArray[np.bool_] | None:
     :param samples: of any environment
     :return: (n, (2 LOCAL_REACH + 1)^2 - 1), row by row; None where obstacles are not known
     """
-    steps = np.arange(-LOCAL_REACH, LOCAL_REACH + 1)
-    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    offsets = offsets[(offsets != 0).any(axis=1)]
-    env, factors = samples.env, samples.factors
-    if isinstance(env, ScanNavVectorEnv):
-        return _blocked_in_scans(factors["agent"][:, None] + env.forward_step * offsets, factors["scene"], env.scans)
-    if isinstance(env, Nav2DVectorEnv):
-        points = factors["agent"][:, None] + offsets
-        outside = ((points < 0) | (points >= SIZE)).any(axis=-1)
-        x, y = np.moveaxis(np.clip(points, 0, SIZE - 1), -1, 0)
-        blocked: NDArray[np.bool_] = outside | factors["obstacles"][np.arange(len(points))[:, None], y, x]
-        return blocked
-    if isinstance(env, PointMazeVectorEnv):
-        points = factors["agent"][:, None] + offsets
-        outside = (np.abs(points) > ROOM_SIZE / 2).any(axis=-1)
-        within = (np.abs(points[:, :, None] - factors["obstacles"][:, None]) < _HALF_OBSTACLE).all(axis=-1)
-        blocked = outside | within.any(axis=-1)
-        return blocked
-    return None
-
-
-def _blocked_in_scans(points: NDArray[Any], scenes: NDArray[Any], scans: list[ScanMap]) -> NDArray[np.bool_]:
-    """Whether an agent's center cannot be at (x, y) in m, (n, m, 2), of the scans with these indices (n,)."""
-    blocked = np.ones(points.shape[:2], dtype=bool)
-    for k in np.unique(scenes).tolist():
-        scan = scans[k]
-        here = scenes == k
-        column = np.floor((points[here, :, 0] - scan.origin[0]) / scan.meters_per_pixel).astype(np.int64)
-        row = np.floor((scan.origin[1] - points[here, :, 1]) / scan.meters_per_pixel).astype(np.int64)
-        height, width = scan.walkable.shape
-        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        walkable = scan.walkable[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-        blocked[here] = ~(inside & walkable)
+    if not offers(type(samples.env), "blocked_around"):
+        return None
+    blocked: NDArray[np.bool_] = samples.env.blocked_around(samples.factors, offsets_within(LOCAL_REACH))
     return blocked
 
 

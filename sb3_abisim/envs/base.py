@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from sb3_abisim.common.arguments import checked_arguments
+from sb3_abisim.envs.shortest_paths import ShortestPaths
 
 # Observations of all copies together take no more.
 MAX_BATCH_BYTES = 2**32
@@ -143,6 +144,22 @@ class BatchEnv(gym.vector.VectorEnv):
         :param factors: name to array of shape (n, ...), as of :meth:`factors`, at any time and in any copies
         :return: (n, *observation shape)
         :raises ValueError: for factors that this environment cannot have
+        """
+        raise NotImplementedError
+
+    def shortest_paths(self, factors: dict[str, NDArray[Any]]) -> ShortestPaths:
+        """What leads to the goal from some states, for read-outs; no loss may read it. Optional.
+
+        :param factors: name to array of shape (n, ...), as of :meth:`factors`, at any time and in any copies
+        """
+        raise NotImplementedError
+
+    def blocked_around(self, factors: dict[str, NDArray[Any]], offsets: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which points around the agent it cannot be at, for probes and read-outs; no loss may read it. Optional.
+
+        :param factors: name to array of shape (n, ...), as of :meth:`factors`, at any time and in any copies
+        :param offsets: (x, y) from the agent, in the unit that suits the environment, (n_points, 2)
+        :return: (n, n_points); also true outside the world
         """
         raise NotImplementedError
 
@@ -322,6 +339,15 @@ def batch_class(env_id: str) -> type[BatchEnv] | None:
     if isinstance(creator, str):
         creator = gym.envs.registration.load_env_creator(creator)
     return creator if isinstance(creator, type) and issubclass(creator, BatchEnv) else None
+
+
+def offers(env: type, method: str) -> bool:
+    """Whether a class writes an optional method of :class:`BatchEnv`.
+
+    :param env: any class
+    :param method: its name
+    """
+    return issubclass(env, BatchEnv) and getattr(env, method) is not getattr(BatchEnv, method)
 
 
 def one_of(observations: Any, index: int, copy: bool = False) -> Any:

@@ -6,8 +6,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_abisim.common.grids import flood_fill
+from sb3_abisim.common.grids import fewest_steps, flood_fill
 from sb3_abisim.envs.base import BatchEnv, SingleEnv
+from sb3_abisim.envs.shortest_paths import ShortestPaths
 
 SIZE = 15
 N_OBSTACLES = 20
@@ -220,6 +221,34 @@ class Nav2DVectorEnv(BatchEnv):
         obstacles = self._observations[:, 1].reshape(-1, SIZE, SIZE) > 0
         factors = {"agent": self._positions(self._agents), "obstacles": obstacles}
         return factors | ({} if self.goal == "center" else {"goal": self._positions(self._goals)})
+
+    def shortest_paths(self, factors: dict[str, NDArray[Any]]) -> ShortestPaths:
+        """See :meth:`BatchEnv.shortest_paths`; distances in steps.
+
+        :param factors: see the class
+        """
+        agents = factors["agent"]
+        goals = np.broadcast_to(factors.get("goal", GOAL), agents.shape)
+        cells, goal_cells = (places[:, 1] * SIZE + places[:, 0] for places in (agents, goals))
+        optimal, geodesic = np.zeros((len(agents), len(MOVES)), dtype=bool), np.zeros(len(agents))
+        for i, obstacles in enumerate(factors["obstacles"]):
+            nexts = next_cells(obstacles.ravel())
+            steps = fewest_steps(nexts, goal_cells[[i]])[:, 0]
+            geodesic[i] = steps[cells[i]]
+            optimal[i] = steps[nexts[cells[i]]] < geodesic[i]
+        return ShortestPaths(optimal, geodesic, np.abs(agents - goals).sum(axis=1).astype(np.float64))
+
+    def blocked_around(self, factors: dict[str, NDArray[Any]], offsets: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See :meth:`BatchEnv.blocked_around`; points are cells.
+
+        :param factors: see the class
+        :param offsets: (n_points, 2)
+        """
+        points = factors["agent"][:, None] + offsets
+        outside = ((points < 0) | (points >= SIZE)).any(axis=-1)
+        x, y = np.moveaxis(np.clip(points, 0, SIZE - 1), -1, 0)
+        blocked: NDArray[np.bool_] = outside | factors["obstacles"][np.arange(len(points))[:, None], y, x]
+        return blocked
 
     def _positions(self, indices: NDArray[np.int64]) -> NDArray[np.int64]:
         """The (x, y) of one cell in each copy, shape (num_envs, 2)."""

@@ -1,7 +1,9 @@
-"""The ladder: targets against a layout solved by hand, and what a perfect embedding scores."""
+"""The ladder: targets are the environment's, learned on one split and scored on each; who offers none is refused."""
 
 import json
 
+import gymnasium as gym
+import index_env  # noqa: F401  (registers an environment without shortest paths)
 import numpy as np
 import pytest
 import torch as th
@@ -9,41 +11,73 @@ from torch import nn
 
 from sb3_abisim.analysis import command as analyze
 from sb3_abisim.analysis import readouts
-from sb3_abisim.analysis.nav2d_exact import GOAL_CELL, SIZE
-from sb3_abisim.envs.nav2d import GOAL, MOVES
+from sb3_abisim.envs.base import BatchEnv, SingleEnv
+from sb3_abisim.envs.nav2d import SIZE
+from sb3_abisim.envs.shortest_paths import ShortestPaths
 from sb3_abisim.networks.encoder_file import load_encoder
+from sb3_abisim.registry import EnvTraits, register_traits
 
 
-@pytest.fixture()
-def one_layout(monkeypatch):
-    """Nothing but a wall of three cells left of the goal, and states two cells to the left and five to the right."""
-    obstacles = np.zeros((SIZE, SIZE), dtype=bool)
-    x, y = GOAL
-    obstacles[y - 1 : y + 2, x - 1] = True
-    monkeypatch.setattr(readouts, "eval_layouts", lambda *_: obstacles.ravel()[None])
-    monkeypatch.setattr(readouts, "reachable", lambda _: np.array([GOAL_CELL, GOAL_CELL - 2, GOAL_CELL + 5]))
+class SignsVectorEnv(BatchEnv):
+    """One byte says which of two actions is best, in the split "eval" which is not, and another how far it is."""
+
+    def __init__(self, num_envs=1, max_episode_steps=None, render_mode=None, autoreset=True, split="train"):
+        space = gym.spaces.Box(0, 255, (3, 4, 4), np.uint8)
+        super().__init__(num_envs, space, gym.spaces.Discrete(2), max_episode_steps, render_mode, autoreset)
+        self._flip, self._state = split == "eval", np.zeros((num_envs, 2), dtype=np.int64)
+
+    def _reset_envs(self, indices):
+        for i in indices:
+            self._state[i] = self._generators[i].integers(0, 2), self._generators[i].integers(0, 200)
+
+    def _observe(self, indices):
+        best, far = self._state[indices].T
+        shown = np.zeros((len(indices), 3, 4, 4), dtype=np.uint8)
+        shown[:, 0], shown[:, 1] = (255 * (best ^ self._flip))[:, None, None], far[:, None, None]
+        return shown
+
+    def factors(self):
+        return {"state": self._state.copy()}
+
+    def shortest_paths(self, factors):
+        best, far = factors["state"].T
+        return ShortestPaths(best[:, None] == np.arange(2), far + 3.0, np.full(len(far), 3.0))
 
 
-def test_targets_of_a_layout_solved_by_hand(one_layout):
-    shown, targets = readouts.sample_states("Nav2D-v0", 1)
-    assert len(shown) == 2, "without the goal"
-    left = int(np.argmax([shown[i, 0].ravel().argmax() == GOAL_CELL - 2 for i in range(2)]))
-    optimal, excess = targets["optimal_action"].values, targets["geodesic_excess"].values[:, 0]
-    up, down, to_left, to_right = ((0, -1), (0, 1), (-1, 0), (1, 0))
-    best = {move: bool(optimal[left, MOVES.index(move)]) for move in MOVES}
-    assert best == {up: True, down: True, to_left: False, to_right: False}, "around the wall, up or down"
-    best = {move: bool(optimal[1 - left, MOVES.index(move)]) for move in MOVES}
-    assert best == {up: False, down: False, to_left: True, to_right: False}
-    assert excess[left] == 4 and excess[1 - left] == 0
-    # Of the four cells one move away, the right one is blocked; two moves away, those above and below it.
-    assert targets["blocked_1"].values[left].sum() == 1 and targets["blocked_2"].values[left].sum() == 2
-    # Five cells to the right of the goal, the grid ends three cells on.
-    assert targets["blocked_2"].values[1 - left].sum() == 0 and targets["blocked_3"].values[1 - left].sum() == 1
-    assert targets["blocked_4"].values[1 - left].sum() == 3
+class SignsEnv(SingleEnv):
+    batch_class = SignsVectorEnv
+
+
+gym.register("Signs-v0", entry_point=SignsEnv, vector_entry_point=SignsVectorEnv, max_episode_steps=5)
+register_traits("Signs-v0", EnvTraits(splits=("eval", "train")))
+
+
+class FirstPixels(nn.Module):
+    def forward(self, x):
+        return x[:, :2, 0, 0]
+
+
+def test_an_environment_of_ones_own_is_learned_on_train_and_scored_on_each_split():
+    learn, tests = readouts.sample_settings("Signs-v0", 60, seed=5)
+    scores = readouts.readouts(FirstPixels(), learn, tests)
+    assert list(scores) == ["train split", "eval split"]
+    assert scores["train split"]["optimal_action"] == 1.0 and scores["eval split"]["optimal_action"] == 0.0
+    assert min(scores[name]["geodesic_excess"] for name in scores) > 0.99
+    assert set(scores["train split"]) == {"optimal_action", "geodesic_excess"}, "blocked points it does not know"
+
+
+def test_states_are_first_ones_of_other_episodes_each():
+    (shown, _), tests = readouts.sample_settings("Nav2D-v0", 70, seed=9)
+    ((tested, _),) = tests.values()
+    assert len({one.tobytes() for one in np.concatenate([shown, tested])}) == 140
+    env = gym.make("Nav2D-v0")
+    for k in (0, 49, 50, 69):
+        np.testing.assert_array_equal(shown[k], env.reset(seed=9 + k)[0])
+        np.testing.assert_array_equal(tested[k], env.reset(seed=9 + 70 + k)[0])
 
 
 class Pixels(nn.Module):
-    """All pixels as the embedding, around the agent: knows what is blocked."""
+    """The obstacles around the agent: knows what is blocked."""
 
     def forward(self, x):
         n = len(x)
@@ -56,17 +90,59 @@ class Pixels(nn.Module):
 
 
 def test_what_an_embedding_holds_is_read_and_nothing_else():
-    scores = readouts.readouts(Pixels(), "Nav2D-v0", n_layouts=40)
-    assert all(scores[f"blocked_{n}"] > 0.999 for n in readouts.DISTANCES)
+    (scores,) = readouts.readouts(Pixels(), *readouts.sample_settings("Nav2D-v0", 600)).values()
+    assert all(scores[f"blocked_{n}"] > 0.99 for n in readouts.DISTANCES)
     assert scores["optimal_action"] < 0.9, "where the goal is, it does not know"
+
+
+@pytest.mark.parametrize(
+    ("env_id", "settings", "n_actions"),
+    [
+        ("ContinuousDistractorPointMazeRandomGoal-v0", ["train clips", "eval clips"], 4),
+        ("PointMazeRandomGoal-v0", ["eval layouts"], 4),
+        ("Nav2DRandomGoal-v0", ["eval layouts"], 4),
+        ("ScanNav-v0", ["eval episodes"], 3),
+    ],
+)
+def test_targets_of_our_environments(env_id, settings, n_actions):
+    learn, tests = readouts.sample_settings(env_id, 4)
+    assert list(tests) == settings
+    for shown, targets in (learn, *tests.values()):
+        assert len(shown) == 4 and targets["optimal_action"].values.shape == (4, n_actions)
+        assert (targets["optimal_action"].values.sum(axis=1) >= 1).mean() > 0.7
+        assert (targets["geodesic_excess"].values > -0.02).all()
+        assert [targets[f"blocked_{n}"].values.shape for n in (1, 2, 3, 4)] == [(4, 4), (4, 8), (4, 12), (4, 16)]
 
 
 def test_the_command_writes_table_and_numbers(tmp_path, capsys):
     output = tmp_path / "new" / "readouts.json"
-    analyze.main(["readouts", "Nav2D-v0/ssi", "--n-layouts", "3", "-o", str(output)])
+    analyze.main(["readouts", "Nav2D-v0/ssi", "-n", "60", "-o", str(output)])
     assert "| Nav2D-v0/ssi |" in capsys.readouterr().out
     (result,) = json.loads(output.read_text())["encoders"].values()
     assert result["hash"] == load_encoder("Nav2D-v0/ssi").hash and result["objective"] == "ssi"
-    with pytest.raises(SystemExit):
-        analyze.main(["readouts", "Nav2D-v0/ssi", "--env", "PointMaze-v0"])
-    assert "Nav2D alone" in capsys.readouterr().err
+    assert list(result["scores"]) == ["eval layouts"]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("IndexEnv-v0", "IndexEnv-v0 offers none; write shortest_paths() in its BatchEnv"),
+        ("CartPole-v1", "CartPole-v1 offers none; write shortest_paths() in its BatchEnv"),
+        ("Nav3D-v0", "unknown environment 'Nav3D-v0'"),
+    ],
+)
+def test_who_offers_nothing_is_refused_with_the_remedy(env_id, message, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        analyze.main(["readouts", "Nav2D-v0/ssi", "--env", env_id])
+    assert stopped.value.code == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()[-1:]
+    assert message in line
+
+
+def test_no_states_and_stacked_observations_are_refused():
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        readouts.sample_states("Nav2D-v0", 0)
+    file = load_encoder("Nav2D-v0/ssi")
+    file.metadata["preprocessing"]["frame_stack"] = 2
+    with pytest.raises(ValueError, match="plain observations, and stacked was pretrained on others"):
+        readouts.compare({"stacked": file}, "Nav2D-v0", 5)

@@ -154,3 +154,24 @@ def test_unknown_layout():
         Nav2DEnv(goal="corner")
     with pytest.raises(ValueError, match="goal='corners' may be blocked in layout='maze'; give goal='random'"):
         Nav2DEnv(layout="maze", goal="corners")
+
+
+def test_shortest_paths_solved_by_hand():
+    """Nothing but a wall of three cells left of the goal, and states two cells to the left and five to the right."""
+    obstacles = np.zeros((15, 15), dtype=bool)
+    x, y = GOAL
+    obstacles[y - 1 : y + 2, x - 1] = True
+    env = Nav2DVectorEnv()
+    states = {"agent": np.array([(x - 2, y), (x + 5, y)]), "obstacles": np.array([obstacles, obstacles])}
+    up, down, left, right = ((0, -1), (0, 1), (-1, 0), (1, 0))
+    for goal, factors in ((GOAL, {}), ((0, 0), {"goal": np.zeros((2, 2), dtype=np.int64)})):
+        paths = env.shortest_paths({**states, **factors})
+        best = [{move for move, is_best in zip(MOVES, row, strict=True) if is_best} for row in paths.optimal]
+        if goal == GOAL:
+            assert best == [{up, down}, {left}], "around the wall, up or down"
+            assert paths.geodesic.tolist() == [6, 5] and paths.straight.tolist() == [2, 5]
+        else:
+            assert best == [{up, left}, {up, left}]
+            assert paths.geodesic.tolist() == paths.straight.tolist() == [x - 2 + y, x + 5 + y]
+    around = env.blocked_around(states, np.array([right, left, (1, -1), (3, 0)]))
+    assert around.tolist() == [[True, False, True, False], [False, False, False, True]]

@@ -15,6 +15,7 @@ from sb3_abisim.envs.point_maze.layout import (
     N_OBSTACLES,
     OBSTACLE_PIXELS,
     PIXELS_PER_METER,
+    ROOM_SIZE,
     WALL_PIXELS,
     goal_mask,
     sample_layout,
@@ -22,10 +23,11 @@ from sb3_abisim.envs.point_maze.layout import (
     to_meters,
     to_pixels,
 )
+from sb3_abisim.envs.point_maze.paths import find_paths, solid_within
 from sb3_abisim.envs.point_maze.top_down import AGENT_RADIUS, DIRECTIONS, IMAGE_SIZE
+from sb3_abisim.envs.shortest_paths import ShortestPaths
 
 MAX_THREADS = 1024
-ROOM_SIZE = 15.0  # m, between the walls
 
 # The point body of gymnasium-robotics (assets/point/point.xml); a test compares the two.
 BALL_RADIUS = 0.1  # m
@@ -326,6 +328,22 @@ class PointMazeVectorEnv(BatchEnv):
         if self.momentum:
             factors["velocity"] = self._velocity.astype(np.float32)
         return factors
+
+    def shortest_paths(self, factors: dict[str, NDArray[Any]]) -> ShortestPaths:
+        """See :meth:`BatchEnv.shortest_paths`: of full pushes up, down, left and right from rest, distances in m.
+
+        :param factors: see the class
+        """
+        agents, obstacles, goals = (factors[name].astype(np.float64) for name in ("agent", "obstacles", "goal"))
+        return find_paths(agents, obstacles, goals, BALL_RADIUS, float(np.abs(self._pushes).max()))
+
+    def blocked_around(self, factors: dict[str, NDArray[Any]], offsets: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See :meth:`BatchEnv.blocked_around`; points are a meter apart.
+
+        :param factors: see the class
+        :param offsets: (n_points, 2)
+        """
+        return solid_within(factors["agent"][:, None] + offsets, factors["obstacles"])
 
 
 class PointMazeEnv(SingleEnv):

@@ -15,6 +15,7 @@ N_OBSTACLES = 20
 OBSTACLE_PIXELS = 8
 GOAL_RADIUS = 1.0  # m
 GOAL_MARK_PIXELS = 4
+ROOM_SIZE = (IMAGE_SIZE - 2 * WALL_PIXELS) / PIXELS_PER_METER  # m, between the walls
 CORNER_DISTANCE = 3.5  # m, of goals in the corners from the center along each axis
 
 _CENTER = IMAGE_SIZE // 2

@@ -16,6 +16,7 @@ from sb3_abisim.envs.point_maze.top_down import enlarge
 from sb3_abisim.envs.scan_nav.map import ScanMap
 from sb3_abisim.envs.scan_nav.view import MARKER_RADIUS, MARKERS, MarkerPainter, SceneView
 from sb3_abisim.envs.scan_nav.world import NODE, ScanWorld, StartRule
+from sb3_abisim.envs.shortest_paths import ShortestPaths, open_distances
 
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 2048
 OBS_MODES = ("rgbd", "dict", "rgb")
@@ -222,11 +223,6 @@ class ScanNavVectorEnv(BatchEnv):
 
     # Steps.
 
-    def _moves(
-        self, fields: NDArray[np.int64], positions: NDArray[np.float64], headings: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        return self._world.moves(fields, positions, headings, self.forward_step, self.allow_sliding)
-
     def _advance(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         code = actions if self.stop == "action" else actions + 1
         before = self._distance
@@ -234,7 +230,9 @@ class ScanNavVectorEnv(BatchEnv):
         self._collided = np.zeros(self.num_envs, dtype=bool)
         if len(forward):
             old = self._position[forward]
-            new, self._collided[forward] = self._moves(self._field[forward], old, self._heading[forward])
+            new, self._collided[forward] = self._world.moves(
+                self._field[forward], old, self._heading[forward], self.forward_step, self.allow_sliding
+            )
             self._position[forward] = new
             self._path[forward] += np.hypot(*(new - old).T)
             self._distance = before.copy()
@@ -263,17 +261,43 @@ class ScanNavVectorEnv(BatchEnv):
 
         :return: shape (num_envs,)
         """
-        half = int(180 // self.turn_angle)
-        turns = np.array(sorted(range(-half, half + 1), key=abs))
-        headings = self._heading[:, None] + turns * self.turn_angle
-        fields, positions = self._field.repeat(len(turns)), self._position.repeat(len(turns), axis=0)
-        moved, _ = self._moves(fields, positions, headings.ravel())
-        left = self._world.distances(fields, moved).reshape(headings.shape)
-        best = turns[np.argmin(np.round(left, 6), axis=1)]
+        return self._oracle_actions(self._field, self._position, self._heading, self._distance)
+
+    def _oracle_actions(
+        self,
+        fields: NDArray[np.int64],
+        positions: NDArray[np.float64],
+        headings: NDArray[np.float64],
+        distances: NDArray[np.float64],
+    ) -> NDArray[np.int64]:
+        best = self._world.best_turns(
+            fields, positions, headings, self.turn_angle, self.forward_step, self.allow_sliding
+        )
         actions = np.where(best == 0, 1, np.where(best > 0, 2, 3))
         if self.stop == "auto":
             return np.asarray(actions - 1)
-        return np.where(self._distance < self.success_distance, 0, actions)
+        return np.where(distances < self.success_distance, 0, actions)
+
+    def shortest_paths(self, factors: dict[str, NDArray[Any]]) -> ShortestPaths:
+        """See :meth:`BatchEnv.shortest_paths`: the actions of :meth:`oracle_actions`, and distances in m.
+
+        :param factors: see the class
+        :raises ValueError: for a goal that was given as a reset option
+        """
+        fields = self._world.fields_of(factors["scene"], factors["goal"])
+        offsets = factors["agent"] - factors["goal"]
+        distances = self._world.distances(fields, offsets)
+        actions = self._oracle_actions(fields, offsets, factors["heading"], distances)
+        optimal = actions[:, None] == np.arange(self.single_action_space.n)  # type: ignore[attr-defined]
+        return ShortestPaths(optimal, distances, open_distances(offsets))
+
+    def blocked_around(self, factors: dict[str, NDArray[Any]], offsets: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """See :meth:`BatchEnv.blocked_around`; points are a step forward apart, their y to the north.
+
+        :param factors: see the class
+        :param offsets: (n_points, 2)
+        """
+        return self._world.blocked(factors["scene"], factors["agent"][:, None] + self.forward_step * offsets)
 
     # Observations.
 

@@ -1,10 +1,10 @@
-"""Where one can walk in ScanNav and how far it is: goals, geodesic distances, starts, steps.
+"""Where one can walk in ScanNav and how far it is: scenes, goals, starts.
 
-Everything about a goal happens on a square grid of nodes around it, its *field*: the geodesic distance of each node to
-the goal, infinite where there is no way inside the view. Positions are in meters east and north of the goal.
+Everything about a goal happens on a square grid of nodes around it, its *field*
+(:mod:`~sb3_abisim.envs.shortest_paths`), which is as large as the view. Positions are in meters east and north of the
+goal.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sb3_abisim.envs.scan_nav.files import SceneError
 from sb3_abisim.envs.scan_nav.map import ScanMap
+from sb3_abisim.envs.shortest_paths import DistanceFields
 
 NODE = 0.05  # m between neighboring nodes
 # A goal is used if this share of points sampled in its view are starts, so that sampling one ends soon.
@@ -21,66 +22,7 @@ MIN_START_SHARE = 0.005
 MAX_GOALS_TRIED = 300
 # Of all goals' fields, each of which is computed when it is first used.
 MAX_FIELD_BYTES = 64 * 2**30
-_SUBSTEP = NODE / 2
 _N_SAMPLES = 16
-_CORNERS = np.array(((0, 0), (0, 1), (1, 0), (1, 1)))
-# (rows, columns) of each way, and the nodes that it passes by and that must be free as well.
-_WAYS: tuple[tuple[tuple[int, int], tuple[tuple[int, int], ...]], ...] = (
-    ((0, 1), ()),
-    ((1, 0), ()),
-    ((1, 1), ((0, 1), (1, 0))),
-    ((1, -1), ((0, -1), (1, 0))),
-    ((1, 2), ((0, 1), (1, 1))),
-    ((2, 1), ((1, 0), (1, 1))),
-    ((1, -2), ((0, -1), (1, -1))),
-    ((2, -1), ((1, 0), (1, -1))),
-)
-
-
-class DistanceGrid:
-    """Geodesic distances to the middle of a square grid of nodes.
-
-    Ways lead to 16 neighbors (those of a king and of a knight in chess), so a distance is too long by 2.7 % at most.
-
-    :param half: nodes on each side of the middle one
-    """
-
-    def __init__(self, half: int) -> None:
-        self.size = 2 * half + 1
-        self._middle = half * self.size + half
-        rows, columns = np.indices((self.size, self.size))
-        self._edges = []
-        for (down, right), passed in _WAYS:
-            there = (rows + down < self.size) & (columns + right >= 0) & (columns + right < self.size)
-            begin = (rows * self.size + columns)[there]
-            others = [begin + down * self.size + right, *(begin + r * self.size + c for r, c in passed)]
-            self._edges.append((begin, others, NODE * float(np.hypot(down, right))))
-
-    def distances(self, free: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """Length of the shortest way from each node to the middle one.
-
-        :param free: nodes that a way may touch, (size, size)
-        :return: in m, (size, size), infinite where there is no way
-        """
-        from scipy.sparse import csr_array
-        from scipy.sparse.csgraph import dijkstra
-
-        flat = free.ravel()
-        begins, ends, lengths = [], [], []
-        for begin, others, length in self._edges:
-            passable = flat[begin]
-            for other in others:
-                passable = passable & flat[other]
-            begins.append(begin[passable])
-            ends.append(others[0][passable])
-            lengths.append(np.full(len(begins[-1]), length))
-        nodes = (np.concatenate(begins), np.concatenate(ends))
-        graph = csr_array((np.concatenate(lengths), nodes), shape=(flat.size, flat.size))
-        found = dijkstra(graph, directed=False, indices=self._middle)
-        if not flat[self._middle]:
-            found[self._middle] = np.inf
-        field: NDArray[np.float32] = found.astype(np.float32).reshape(self.size, self.size)
-        return field
 
 
 @dataclass(frozen=True)
@@ -112,7 +54,7 @@ class StartRule:
         return keep
 
 
-class ScanWorld:
+class ScanWorld(DistanceFields):
     """Goals of several scenes with their fields, and what can be asked about positions in them.
 
     Field ``scene * n_goals + k`` is that of the scene's goal k, computed when it is first needed; the last
@@ -131,32 +73,22 @@ class ScanWorld:
         self, scans: list[ScanMap], pitch: float, reach: float, n_goals: int, n_custom: int, rule: StartRule
     ) -> None:
         self.scans, self.pitch, self.n_goals, self.rule = scans, pitch, n_goals, rule
-        self.half = int(reach / NODE)
-        self._grid = DistanceGrid(self.half)
-        # A ring of blocked nodes is the wall around the view.
-        self._across, self._middle = self._grid.size + 2, self.half + 1
-        offsets = np.arange(-self._middle, self._middle + 1) * NODE
-        self._straight = np.hypot(offsets[:, None], offsets)
-        self._origins = np.array([scan.origin for scan in scans])
-        self._places = [_places(scan, pitch) for scan in scans]
-        n_fields = len(scans) * n_goals + n_custom
-        if (n_bytes := n_fields * self._across**2 * 4) > MAX_FIELD_BYTES:
+        half, n_fields = int(reach / NODE), len(scans) * n_goals + n_custom
+        if (n_bytes := n_fields * (2 * half + 3) ** 2 * 4) > MAX_FIELD_BYTES:
             raise ValueError(
                 f"{n_goals} goals in each of {len(scans)} scenes would take {n_bytes / 2**30:.0f} GB; lower "
                 "goals_per_scene or view_size"
             )
+        super().__init__(half, NODE, n_fields)
+        offsets = np.arange(-self._middle, self._middle + 1) * NODE
+        self._straight = np.hypot(offsets[:, None], offsets)
+        self._origins = np.array([scan.origin for scan in scans])
+        self._places = [_places(scan, pitch) for scan in scans]
         self.custom_fields = np.arange(n_fields - n_custom, n_fields)
-        # Memory that is never written is never taken.
-        self._fields = np.empty((n_fields, self._across, self._across), dtype=np.float32)
         self._ready = np.zeros(n_fields, dtype=bool)
         self.corners = np.zeros((n_fields, 2), dtype=np.int64)  # row and column of the goals
         for scene in range(len(scans)):
             self.prepare_goal(scene, 0)
-
-    @property
-    def _flat(self) -> NDArray[np.float32]:
-        """A view of the fields; kept as an attribute, a copy of the world would have one of something else."""
-        return self._fields.reshape(-1)
 
     def __getstate__(self) -> dict[str, Any]:
         """For ``copy`` and ``pickle``: of the fields, those that have been computed."""
@@ -234,7 +166,7 @@ class ScanWorld:
         rows, columns = (np.floor((k * self.pitch + offsets) / scale).astype(np.int64) for k in corner)
         known = ((rows >= 0) & (rows < height))[:, None] & (columns >= 0) & (columns < width)
         free = scan.walkable[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)] & known
-        return np.pad(self._grid.distances(free), 1, constant_values=np.inf)
+        return self.compute_field(free)
 
     def _start_share(self, distances: NDArray[np.float32]) -> float:
         """The probability that a point sampled uniformly in the view becomes a start."""
@@ -264,37 +196,81 @@ class ScanWorld:
             if len(taken):
                 return np.asarray(positions[taken[0]])
 
-    def distances(self, fields: NDArray[np.int64], positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Geodesic distances: bilinear between four nodes; beside obstacles, the best way over one of them.
+    def fields_of(self, scenes: NDArray[np.int64], goals: NDArray[np.float64]) -> NDArray[np.int64]:
+        """The fields of goals, computed where they were not needed before.
+
+        :param scenes: index of each
+        :param goals: x and y in m, in the scans' coordinates, (n, 2)
+        :return: (n,)
+        :raises ValueError: for one that is not of its scene's pool
+        """
+        wanted, which = np.unique(
+            np.column_stack([scenes, self.corners_at(scenes, goals)]), axis=0, return_inverse=True
+        )
+        found = np.array([self._field_at(scene, (row, column)) for scene, row, column in wanted.tolist()])
+        fields: NDArray[np.int64] = found[which]
+        return fields
+
+    def _field_at(self, scene: int, corner: tuple[int, int]) -> int:
+        first = scene * self.n_goals
+        pool = slice(first, first + self.n_goals)
+        while True:
+            there = np.flatnonzero(self._ready[pool] & (self.corners[pool] == corner).all(axis=1))
+            if len(there):
+                return first + int(there[0])
+            missing = np.flatnonzero(~self._ready[pool])
+            if not len(missing):
+                raise ValueError(
+                    f"{self.scans[scene].source}: the goal at the pixels' corner {corner} is none of its "
+                    f"{self.n_goals}; take states of this setting, without the reset option goal"
+                )
+            self.prepare_goal(scene, int(missing[0]))
+
+    def best_turns(
+        self,
+        fields: NDArray[np.int64],
+        positions: NDArray[np.float64],
+        headings: NDArray[np.float64],
+        angle: float,
+        length: float,
+        sliding: bool,
+    ) -> NDArray[np.int64]:
+        """How many turns to the left lead to where a step forward gains most, the fewest of equal ones.
 
         :param fields: (n,)
-        :param positions: (n, 2)
-        :return: in m, (n,), infinite where no node near has a way
+        :param positions: (n, 2), open ones
+        :param headings: in degrees, (n,)
+        :param angle: of a turn, in degrees
+        :param length: of the step, in m
+        :param sliding: see :meth:`moves`
+        :return: (n,), negative to the right
         """
-        cells = positions[:, ::-1] * (-1 / NODE, 1 / NODE) + self._middle
-        upper_left = np.floor(cells)
-        # Shares (n, 4, 2) of the way from each of the four nodes, by row and column.
-        away = abs((cells - upper_left)[:, None] - _CORNERS)
-        first = fields * self._across**2 + (upper_left @ (self._across, 1)).astype(np.int64)
-        nodes = self._flat[first[:, None] + _CORNERS @ (self._across, 1)].astype(np.float64)
-        weights = (1 - away).prod(axis=2)
-        known = nodes < np.inf
-        if known.all():
-            return np.asarray((nodes * weights).sum(axis=1))
-        smooth = (np.where(known, nodes, 0) * weights).sum(axis=1)
-        over_one = (nodes + NODE * np.hypot(away[..., 0], away[..., 1])).min(axis=1)
-        return np.asarray(np.where(known.all(axis=1), smooth, over_one))
+        half = int(180 // angle)
+        turns = np.array(sorted(range(-half, half + 1), key=abs))
+        directions = headings[:, None] + turns * angle
+        fields, positions = fields.repeat(len(turns)), positions.repeat(len(turns), axis=0)
+        moved, _ = self.moves(fields, positions, directions.ravel(), length, sliding)
+        left = self.distances(fields, moved).reshape(directions.shape)
+        best: NDArray[np.int64] = turns[np.argmin(np.round(left, 6), axis=1)]
+        return best
 
-    def is_open(self, fields: NDArray[np.int64], positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether one can stand there: the nearest node has a way to the goal.
+    def blocked(self, scenes: NDArray[np.int64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether an agent's center cannot be at points of the scans.
 
-        :param fields: (...)
-        :param positions: (..., 2), not further than a node's distance outside the view
+        :param scenes: indices, (n,)
+        :param points: x and y in m, in the scans' coordinates, (n, m, 2)
+        :return: (n, m)
         """
-        nodes = np.rint(positions * (1 / NODE, -1 / NODE)).astype(np.int64) + self._middle
-        index = fields * self._across**2 + nodes[..., 1] * self._across + nodes[..., 0]
-        opened: NDArray[np.bool_] = self._flat[index] < np.inf
-        return opened
+        blocked = np.ones(points.shape[:2], dtype=bool)
+        for k in np.unique(scenes).tolist():
+            scan, here = self.scans[k], scenes == k
+            column = np.floor((points[here, :, 0] - scan.origin[0]) / scan.meters_per_pixel).astype(np.int64)
+            row = np.floor((scan.origin[1] - points[here, :, 1]) / scan.meters_per_pixel).astype(np.int64)
+            height, width = scan.walkable.shape
+            inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            walkable = scan.walkable[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+            blocked[here] = ~(inside & walkable)
+        return blocked
 
     def reaches(self, field: int, position: NDArray[np.float64]) -> bool:
         """Whether any position, inside the view or not, has a way to the goal of a field.
@@ -304,57 +280,6 @@ class ScanWorld:
         """
         inside = bool((abs(position) <= self.half * NODE).all())
         return inside and bool(self.is_open(np.array([field]), position[None])[0])
-
-    def moves(
-        self,
-        fields: NDArray[np.int64],
-        positions: NDArray[np.float64],
-        headings: NDArray[np.float64],
-        length: float,
-        sliding: bool,
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Where steps forward lead.
-
-        :param fields: (n,)
-        :param positions: (n, 2), open ones
-        :param headings: in degrees, 0 is north and 90 west, (n,)
-        :param length: of the step, in m
-        :param sliding: whether to go on along obstacles
-        :return: the new positions (n, 2), and whether something was in the way (n,)
-        """
-        n_steps = math.ceil(length / _SUBSTEP)
-        angles = np.deg2rad(headings)
-        step = np.stack([-np.sin(angles), np.cos(angles)], axis=1) * (length / n_steps)
-        track = positions[:, None] + step[:, None] * np.arange(1, n_steps + 1)[:, None]
-        # A long step may leave the field; nothing beyond its blocked ring is looked at.
-        limit = self._middle * NODE
-        free = self.is_open(fields[:, None], np.clip(track, -limit, limit))
-        collided = np.asarray(~free.all(axis=1))
-        moved = track[:, -1].copy()
-        for i in np.flatnonzero(collided).tolist():
-            # The part of the way before the obstacle is known to be free.
-            n_free = int(np.argmin(free[i]))
-            start = track[i, n_free - 1] if n_free else positions[i]
-            moved[i] = self._creep(int(fields[i]), start.tolist(), step[i].tolist(), n_steps - n_free, sliding)
-        return moved, collided
-
-    def _creep(
-        self, field: int, position: list[float], step: list[float], n_steps: int, sliding: bool
-    ) -> tuple[float, float]:
-        """Small steps along an obstacle, with whichever of the two coordinates goes on; plain numbers are fastest."""
-        nodes, middle = self._fields[field], self._middle
-        (x, y), (east, north) = position, step
-        ways = [(east, north)]
-        if sliding:
-            ways += [(east, 0.0), (0.0, north)] if abs(east) >= abs(north) else [(0.0, north), (east, 0.0)]
-        for _ in range(n_steps):
-            for dx, dy in ways:
-                if nodes[round((y + dy) * (-1 / NODE)) + middle, round((x + dx) * (1 / NODE)) + middle] < np.inf:
-                    x, y = x + dx, y + dy
-                    break
-            else:
-                break
-        return x, y
 
 
 def _places(scan: ScanMap, pitch: float) -> NDArray[np.int64]:

@@ -5,12 +5,13 @@ import pytest
 from scan_inputs import map_of_a_room  # noqa: F401
 
 from sb3_abisim.envs.scan_nav.env import ScanNavVectorEnv
-from sb3_abisim.envs.scan_nav.world import NODE, DistanceGrid, StartRule
+from sb3_abisim.envs.scan_nav.world import NODE, StartRule
+from sb3_abisim.envs.shortest_paths import DistanceGrid
 
 
 def test_distances_against_straight_lines_and_a_corner():
     half = 40
-    grid, rng = DistanceGrid(half), np.random.default_rng(0)
+    grid, rng = DistanceGrid(half, NODE), np.random.default_rng(0)
     field = grid.distances(np.ones((81, 81), dtype=bool))
     rows, columns = rng.integers(0, 81, (2, 200))
     straight = NODE * np.hypot(rows - half, columns - half)
@@ -58,3 +59,22 @@ def test_goals_do_not_depend_on_the_order_of_use(room):
         other._world.prepare_goal(0, k)
     assert np.array_equal(one._world.corners, other._world.corners)
     assert len(np.unique(one._world.corners[:6], axis=0)) > 3
+
+
+@pytest.mark.parametrize("stop", ["auto", "action"])
+def test_shortest_paths_are_those_of_the_agent_that_knows_the_map(room, stop):
+    env, other = (ScanNavVectorEnv(12, scenes=[room, 2], goals_per_scene=3, stop=stop) for _ in range(2))
+    env.reset(seed=0)
+    factors = env.factors()
+    # Another one, which has not been at these goals.
+    paths = other.shortest_paths(factors)
+    assert paths.optimal.sum(axis=1).tolist() == [1] * 12
+    assert np.array_equal(paths.optimal.argmax(axis=1), env.oracle_actions())
+    assert len(set(env.oracle_actions())) > 1
+    np.testing.assert_allclose(paths.geodesic, env._distance, atol=1e-6)
+    straight = np.hypot(*(factors["agent"] - factors["goal"]).T)
+    assert (paths.straight >= straight - 1e-9).all() and (paths.straight <= 1.0275 * straight).all()
+    assert (paths.geodesic > paths.straight - 0.02).all()
+    env.reset(options={"goal": (4.0, 3.0)})
+    with pytest.raises(ValueError, match="is none of its 3; take states of this setting"):
+        env.shortest_paths(env.factors())
