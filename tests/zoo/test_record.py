@@ -75,10 +75,10 @@ def test_an_environment_that_knows_no_success(run_folder, tmp_path, monkeypatch,
 
 
 def test_the_same_seed_records_the_same(run_folder, tmp_path):
-    for name in "ab":
-        record(run_folder, tmp_path / name, n_episodes=1, seed=5)
-    record(run_folder, tmp_path / "c", n_episodes=1, seed=6)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes() != (tmp_path / "c").read_bytes()
+    first, again, other = (tmp_path / f"{name}.gif" for name in "abc")
+    for path, seed in ((first, 5), (again, 5), (other, 6)):
+        record(run_folder, path, n_episodes=1, seed=seed)
+    assert first.read_bytes() == again.read_bytes() != other.read_bytes()
 
 
 def test_the_seed_is_that_of_the_actions_too(run_folder, tmp_path, monkeypatch):
