@@ -14,6 +14,7 @@ import torch as th
 from torch import nn
 
 from sb3_abisim.networks.base import require_size
+from sb3_abisim.networks.resnet import small_layers
 from sb3_abisim.registry import register_network
 
 MIN_SIZE = 16
@@ -47,22 +48,8 @@ class Glimpse(nn.Module):
             # Standardized below, where a bias would cancel out.
             nn.Conv2d(16, n_points, 3, padding=1, bias=False),
         )
-        self.near = nn.Sequential(
-            nn.Conv2d(n_channels, 16, 5, stride=2, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(16, 32, 3, stride=2, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(32, 32, 3, stride=2, padding=1),
-            nn.Flatten(),
-        )
-        self.wide = nn.Sequential(
-            nn.Conv2d(n_channels, 16, 5, stride=4, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(16, 32, 3, stride=2, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(32, 16, 3, stride=2, padding=1),
-            nn.Flatten(),
-        )
+        self.near = small_layers(n_channels, stride=2)
+        self.wide = small_layers(n_channels, n_channels=16)
         steps = th.arange(glimpse_size) - (glimpse_size - 1) / 2
         rows, columns = th.meshgrid(steps * 2 / height, steps * 2 / width, indexing="ij")
         # Follows from the arguments, so no file holds it.

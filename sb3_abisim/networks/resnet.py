@@ -1,4 +1,4 @@
-"""The layers of ScanNav's encoders; :mod:`sb3_abisim.networks.base` wraps them.
+"""The layers of ScanNav's encoders, of which other networks take some; :mod:`sb3_abisim.networks.base` wraps them.
 
 The residual network is the visual encoder of habitat-baselines' PointNav policy, as the paper uses it: half the
 resolution by averaging, a ResNet18 with 32 base planes and group norm, and a compression to 2048 numbers.
@@ -89,18 +89,18 @@ def compression(n_positions: int, features_dim: int = FEATURES_DIM) -> nn.Sequen
     )
 
 
-def small_layers(n_input_channels: int) -> nn.Sequential:
+def small_layers(n_input_channels: int, stride: int = 4, n_channels: int = 32) -> nn.Sequential:
     """128 x 128 images to 2048 = 32 x 8 x 8 numbers, for computers without an accelerator.
 
-    The first stride is 4, since at 2 that layer alone would take most of the time.
-
     :param n_input_channels: channels of the images
+    :param stride: of the first layer, which at 2 would take most of the time on images of this size
+    :param n_channels: of the last layer
     """
     return nn.Sequential(
-        nn.Conv2d(n_input_channels, 16, 5, stride=4, padding=2),
+        nn.Conv2d(n_input_channels, 16, 5, stride=stride, padding=2),
         nn.ReLU(),
         nn.Conv2d(16, 32, 3, stride=2, padding=1),
         nn.ReLU(),
-        nn.Conv2d(32, 32, 3, stride=2, padding=1),
+        nn.Conv2d(32, n_channels, 3, stride=2, padding=1),
         nn.Flatten(),
     )
